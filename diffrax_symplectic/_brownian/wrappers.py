@@ -1,6 +1,6 @@
 import dataclasses
 import math
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
@@ -97,7 +97,8 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 
     path: diffrax.AbstractBrownianPath
     k: int = eqx.field(static=True)
-    unit: RealScalarLike
+    # `None` is the unit of the user's times. (A number would be one more leaf of the path.)
+    unit: RealScalarLike | None
     # A truncated law depends on the size of the step.
     laws: ClassVar[None] = None  # pyright: ignore
 
@@ -106,7 +107,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         path: diffrax.AbstractBrownianPath,
         *,
         k: int = 2,
-        unit: RealScalarLike = 1.0,
+        unit: RealScalarLike | None = None,
     ):
         """**Arguments:**
 
@@ -114,7 +115,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         - `k`: the integer $k \\geq 1$ above.
         - `unit`: the unit of time $u$ above, the same for all steps of a solve. Take one
             that follows from the problem and is much longer than a step, such as 32 times
-            the interval.
+            the interval. `None` means 1.
 
         **Raises:** a `ValueError` if `k` is not a positive integer, if `unit` is not a
         positive number, or if `path` is not a Brownian path or already has bounded
@@ -131,8 +132,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
                 "The increments of a `WeakBrownianPath` are already bounded, and "
                 "truncation would change their moments. Pass it without truncation."
             )
-        is_number = eqx.is_array_like(unit) and jnp.shape(unit) == ()
-        if not is_number or not (is_traced(unit) or 0 < float(unit) < math.inf):
+        if unit is not None and not _may_be_positive(unit):
             raise ValueError(f"`unit` must be a positive number; got {unit!r}.")
         self.path = path
         self.k = whole_number("k", k)
@@ -152,7 +152,9 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 
     def own_increment(self, increment, own_words, h, use_levy) -> Increment:
         h = jnp.abs(h)
-        h_in_units = h / jnp.asarray(self.unit, h.dtype)
+        h_in_units = h
+        if self.unit is not None:
+            h_in_units = h / jnp.asarray(self.unit, h.dtype)
         h_in_units = eqx.error_if(h_in_units, h_in_units >= 1, STEP_BEYOND_UNIT)
         # The bound of an empty step is zero.
         log_h = jnp.log(jnp.where(h_in_units > 0, h_in_units, 1))
@@ -166,6 +168,13 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         return jtu.tree_map(clip, increment)
 
 
+def _may_be_positive(unit: Any) -> bool:
+    """Whether this is a positive finite number, as far as it is known."""
+    if not eqx.is_array_like(unit) or jnp.shape(unit) != ():
+        return False
+    return is_traced(unit) or 0 < float(unit) < math.inf
+
+
 def lost_variance(path: diffrax.AbstractBrownianPath, h: float) -> float:
     """The share of the variance of an increment over a step of size `h` that is lost by
     truncation."""
@@ -173,7 +182,8 @@ def lost_variance(path: diffrax.AbstractBrownianPath, h: float) -> float:
     while isinstance(path, AbstractWrappedPath):
         if isinstance(path, TruncatedBrownianPath):
             # In units of the root of `h`; zero for steps of a `unit` and longer.
-            bound = math.sqrt(2 * path.k * max(-math.log(h / float(path.unit)), 0))
+            unit = 1.0 if path.unit is None else float(path.unit)
+            bound = math.sqrt(2 * path.k * max(-math.log(h / unit), 0))
             share = max(share, _variance_beyond(bound))
         path = path.path
     return share
