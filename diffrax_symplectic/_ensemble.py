@@ -140,11 +140,12 @@ def ensemble(
     [`diffrax_symplectic.monte_carlo`][].
 
     **Noise.** If `terms` hold a shape, the solver makes a path with Gaussian increments.
-    They are bounded for implicit solvers where the noise depends on the state (see
-    [`diffrax_symplectic.TruncatedBrownianPath`][]); a warning says if that takes more than
-    0.1% of their variance. The discrete increments of `want="weak"` take less time, and
-    give the right means of smooth functions only. Solvers with discrete increments only,
-    such as [`diffrax_symplectic.AdditiveGauss`][], need `want="weak"`.
+    They are bounded for implicit solvers where the noise depends on the state, by a
+    [`diffrax_symplectic.TruncatedBrownianPath`][] that takes at most 0.04% of their
+    variance. (A warning says if one of yours takes more than 0.1%.) The discrete increments
+    of `want="weak"` take less time, and give the right means of smooth functions only.
+    Solvers with discrete increments only, such as [`diffrax_symplectic.AdditiveGauss`][],
+    need `want="weak"`.
 
     **Engines.** `engine="drjit"` fuses all steps into one kernel, several times as fast;
     see [Large ensembles][large-ensembles]. `"jax"` is the default.
@@ -168,7 +169,7 @@ def ensemble(
     system uses an operation that cannot be replayed, its state has more than 256 entries,
     or a `PicardNewton` has another tolerance than rounding error, and an `ImportError` if
     Dr.Jit or LLVM is missing. Warns if paths failed, if many are stragglers, and
-    if truncation takes more than 0.1% of the variance of increments.
+    if your own truncation takes more than 0.1% of the variance of increments.
     """
     other_arguments = terms, t0, t1, dt0, y0, args
     key = checked_key("ensemble", key, other_arguments)

@@ -154,7 +154,7 @@ def suggest_solver(
     explicit and needs too many steps, take the next implicit one. Whether noises commute is
     tested at random states, which is no proof.
 
-    They are ranked by: in a heat bath, exact stationary positions (for means); a cost of at
+    They are ranked by: with friction, exact stationary positions (for means); a cost of at
     most twelve stage vectors; order; right energies for noise on stiff modes; fewest stage
     vectors. If masses depend on positions, `BAOAB(ImplicitMidpoint())` comes first.
     [Measured errors](advice.md) support this.
@@ -244,6 +244,8 @@ class _System(NamedTuple):
         treat by a step of its own.
     - `general_bath`: whether it has friction that only `BAOAB(ImplicitMidpoint())` treats
         by a step of its own, as for masses that depend on positions.
+    - `friction_in_drift`: whether it has friction that no solver treats by a step of its
+        own, as beside noise that is not in the forces: all have it in the drift.
     - `constrained`: whether its positions are constrained.
     """
 
@@ -253,6 +255,7 @@ class _System(NamedTuple):
     commute: bool
     friction: bool
     general_bath: bool
+    friction_in_drift: bool
     constrained: bool
 
     def in_a_sentence(self) -> str:
@@ -264,6 +267,8 @@ class _System(NamedTuple):
             parts = f"{self.num_noises} noises that {how}"
         if self.friction or self.general_bath:
             parts = f"friction and {parts}"
+        if self.friction_in_drift:
+            parts = f"friction in the drift and {parts}"
         if self.constrained:
             parts = f"constraints, {parts}"
         fault = self.fault
@@ -317,6 +322,7 @@ def _inspect(
         commute=commute,
         friction=friction,
         general_bath=general_bath,
+        friction_in_drift=len(friction_terms) > 0 and not friction and not general_bath,
         constrained=constrained,
     )
 
@@ -337,6 +343,7 @@ def _suitable(
         num_noises=system.num_noises,
         friction=system.friction,
         general_bath=system.general_bath,
+        friction_in_drift=system.friction_in_drift,
     )
     if system.constrained:
         solvers = [solver for solver in solvers if solver.keeps_constraints]
@@ -415,9 +422,10 @@ def ranked(
     num_noises: int,
     friction: bool = False,
     general_bath: bool = False,
+    friction_in_drift: bool = False,
 ) -> list[AbstractSymplecticSolver]:
     """The suggested solvers for systems of these structures (`"any"` is implied) and with
-    such noises, best first. `friction` and `general_bath` are as in `_System`."""
+    such noises, best first. The last three arguments are as in `_System`."""
     structures = {"any", *structures}
     if {"separable", "constant"} <= structures:
         structures.add("separable and constant")
@@ -427,8 +435,9 @@ def ranked(
         record = _record(solver)
         order = record.order(want, commute)
         assert order is not None
-        # In a heat bath most means are stationary means of functions of positions.
-        wants_stationary = friction and want == "weak"
+        # In a heat bath most means are stationary means of functions of positions. With
+        # friction in the drift, too, other solvers have them up to some friction only.
+        wants_stationary = (friction or friction_in_drift) and want == "weak"
         is_inexact = wants_stationary and "qq" not in record.stationary
         # The sizes of the systems of equations of a step.
         stage_vectors = solver.stage_vectors(num_noises)

@@ -177,6 +177,48 @@ def test_with_friction_solvers_that_have_it_are_suggested(want):
             assert "momenta" in reason[ds.LangevinMiddle]
 
 
+NOISE_BESIDE_A_BATH = {
+    "on p": lambda t, p, q, args: 0.1 * p,
+    "on both": lambda t, p, q, args: 0.1 * p + 0.2 * q,
+    "that does not commute": lambda t, p, q, args: 0.1 * p * q,
+}
+
+
+@pytest.mark.parametrize("noise", NOISE_BESIDE_A_BATH)
+def test_beside_other_noise_strong_friction_in_the_drift_keeps_the_temperature(noise):
+    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+    y0 = jnp.array(0.0), jnp.array(0.0)
+    path = lambda seed: ds.WeakBrownianPath((), jr.key(seed))
+    gamma = 5.0
+    bath = ds.langevin_terms(H0, gamma, 1.0, path(0))
+    other = ds.noise_terms(NOISE_BESIDE_A_BATH[noise], path(1))
+    both = diffrax.MultiTerm(*bath.terms, *other.terms)
+    found = ds.suggest_solver(both, 0.0, y0, want="weak")
+    assert "friction in the drift" in found.system
+    kinds = [type(s.solver) for s in found]
+    assert kinds[0] is ds.SRKw1
+    # In steps of 1, beyond the limit of all that have one, the bath alone is exact.
+    assert_temperature(found[0].solver, gamma)
+    limits = [s.solver.record.most_friction is not None for s in found]
+    assert limits == sorted(limits)
+    worse = next(s.solver for s in found if s.solver.record.most_friction is not None)
+    with pytest.raises(AssertionError):
+        assert_temperature(worse, gamma)
+
+
+def assert_temperature(solver, gamma):
+    """Stationary <p^2> = <q^2> = 1 of an oscillator in a bath of friction `gamma`, in steps
+    of 1, by a linear map."""
+    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
+    path = solver.path((), jr.key(0), want="weak")
+    bath = ds.langevin_terms(H0, gamma, 1.0, path)
+    y0 = jnp.array(0.0), jnp.array(0.0)
+    K = np.asarray(ds.second_moment_map(bath, solver, 0.0, 1.0, y0))
+    moments = np.linalg.solve(np.eye(8) - K[1:, 1:], K[1:, 0])
+    moments = np.append(1.0, moments).reshape(3, 3)
+    np.testing.assert_allclose(moments[1:, 1:], np.eye(2), atol=0.1)
+
+
 def test_many_noises_that_do_not_commute_do_not_ask_for_a_flow_of_each():
     first = lambda m: type(ranked("weak", ["any"], False, m)[0])
     assert first(2) is first(4) is ds.NinomiyaVictoir

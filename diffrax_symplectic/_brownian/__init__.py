@@ -18,9 +18,10 @@ from .levy_area import LevyAreaBrownianPath, LevyAreaIncrement
 from .wrappers import (
     has_bounded_increments,
     lost_variance,
+    STEP_BEYOND_UNIT,
+    TRUNCATE_LESS,
     PlateauBrownianPath,
     PlateauIncrement,
-    TOO_STRONG,
     TruncatedBrownianPath,
 )
 from .variables import drives, most_demanding_variable, path_maker, VARIABLES

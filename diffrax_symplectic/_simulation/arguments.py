@@ -20,7 +20,8 @@ from .._brownian import (
     is_random,
     laws_of,
     lost_variance,
-    TOO_STRONG,
+    STEP_BEYOND_UNIT,
+    TRUNCATE_LESS,
     typed_key,
 )
 from .._custom_types import Args, RealScalarLike, Y
@@ -175,7 +176,7 @@ def check_noise(terms: PyTree) -> None:
 def check_truncation(terms: PyTree, h: float) -> None:
     """Raises a `ValueError` if truncated increments over steps of size `h` are all zero."""
     if any(lost_variance(path, h) == 1 for path in brownian_paths(terms)):
-        raise ValueError(f"{TOO_STRONG} Got dt0={h}.")
+        raise ValueError(f"{STEP_BEYOND_UNIT} Got dt0={h}.")
 
 
 def warn_of_truncation(terms: PyTree, h: float, stacklevel: int) -> None:
@@ -183,12 +184,8 @@ def warn_of_truncation(terms: PyTree, h: float, stacklevel: int) -> None:
     lost = max(lost_variance(path, h) for path in brownian_paths(terms))
     if lost > _MOST_LOST_VARIANCE:
         warnings.warn(
-            "The increments of a `TruncatedBrownianPath`, which implicit solvers get where "
-            f"the noise depends on the state, lose {lost:.1%} of their variance in steps "
-            f"of {h:g}. Take smaller steps (0.1% is lost at h = 1/20); or for means of "
-            "smooth functions discrete increments, by a `WeakBrownianPath`; or a "
-            "`FixedStepBrownianPath`, whose paths fail where a step has no solution; or an "
-            "explicit solver.",
+            f"The increments of a `TruncatedBrownianPath` lose {lost:.1%} of their "
+            f"variance in steps of {h:g}. {TRUNCATE_LESS}",
             stacklevel=stacklevel + 1,
         )
 

@@ -34,6 +34,7 @@ from .._terms import (
     path_numbers,
     step_variables,
     StepVariables,
+    truncated_in_unit,
     which_are_shapes,
     which_need_truncation,
     with_paths_for_shapes,
@@ -57,6 +58,9 @@ from .levels import combinations, Level, level_weights, levels_of
 # of the user's keys are folded into the same key for the paths: this number is unlikely to
 # be one of them.
 _START_KEY = 0x517A87
+# The `unit` of truncated increments that are made here, in units of the interval from `t0`
+# to `t1`: one step over all of it loses 0.04% of its variance, which is no warning.
+_UNIT_OF_TRUNCATION = 32
 
 
 class DrawnStart(NamedTuple):
@@ -152,6 +156,10 @@ class Problem(eqx.Module):
         if any(is_made_by_solver):
             is_needed = which_need_truncation(terms, t0_of_dtype, y0, args)
             terms = _without_needless_truncation(terms, is_made_by_solver, is_needed)
+            # All levels have the same unit. An array: another one compiles nothing anew.
+            unit = _UNIT_OF_TRUNCATION * (float(t1) - float(t0))
+            unit = np.asarray(unit, t0_of_dtype.dtype)
+            terms = truncated_in_unit(terms, is_made_by_solver, unit)
         check_truncation(terms, float(dt0))
         smallest_step = float(dt0) / 2 ** (levels - 1)
         if isinstance(solver, AbstractSymplecticSolver):

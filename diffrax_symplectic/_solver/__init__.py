@@ -22,6 +22,7 @@ from .base import AbstractImplicitStages, AbstractSymplecticRungeKutta
 from .base import AbstractSymplecticSolver
 from .record import Record, Want
 from .general import ImplicitMidpoint, SRKs1, SRKw1, SRKw2
+from .bath import after_friction
 from .beyond import StrangGauss, NinomiyaVictoir, PlateauGauss, LevyAreaMidpoint
 from .separable import SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet, PlateauVerlet
 from .additive import SRKs4, SRKw5, AdditiveGauss

@@ -133,8 +133,8 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
         The path does not know the terms. So where an implicit solver needs increments alone
         and these are Gaussian, it is a [`diffrax_symplectic.TruncatedBrownianPath`][]: with
         noise that depends on the state, steps with unbounded increments may have no
-        solution. It loses variance in long steps. For additive noise, which needs none of
-        this, pass a
+        solution. It loses variance in steps that are not short in its `unit` of time, which
+        is 1. For additive noise, which needs none of this, pass a
         [`diffrax_symplectic.FixedStepBrownianPath`][], or where a shape suffices, the
         shape: [`diffrax_symplectic.expectation`][], [`diffrax_symplectic.ensemble`][] and
         [`diffrax_symplectic.suggest_solver`][] see what the noise depends on.

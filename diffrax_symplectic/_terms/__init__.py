@@ -30,8 +30,9 @@ from .dependence import acts_elementwise, Dependence
 from .drift_and_noise import control_struct, field_of, number_of_noises, split_terms
 from .evaluation import call_user_function
 from .hamiltonian import hamiltonian_terms, noise_terms
-from .langevin import AbstractFriction, bath_terms, friction_apart, FrictionAlong
-from .langevin import langevin_terms, momentum_first, semidefinite_root, split_friction
+from .langevin import AbstractFriction, bath_terms, BathNoise, friction_apart
+from .langevin import FrictionAlong, langevin_terms, momentum_first
+from .langevin import semidefinite_root, split_friction
 from .lifted import has_lifted
 from .paths import brownian_paths, has_unknown_law, path_keys, path_numbers
 from .paths import random_paths, replace_paths, shapes_as_paths, which_are_shapes
@@ -41,7 +42,8 @@ from .step_variables import outcomes, step_variables, StepVariables
 from .structure import additive_fault, check_assertions, check_baths_have_own_noise
 from .structure import check_drifts_differ, check_stratonovich, check_structure
 from .structure import constant_fault, Fault, FRICTION, noises_commute
-from .structure import separable_fault, which_need_truncation, without_truncation
+from .structure import separable_fault, truncated_in_unit
+from .structure import which_need_truncation, without_truncation
 from .symplectic_gradients import IndexedNoise, slow_apart
 from .vector_fields import apply, apply_one, check_fit, rate, tree_sum
 from .waves import from_pair, to_pair, wave_terms

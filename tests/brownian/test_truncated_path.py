@@ -53,6 +53,36 @@ def test_truncation_bound_is_that_of_the_docstring(k):
     np.testing.assert_allclose(W, [-bound, 0, bound], rtol=1e-14, atol=1e-9)
 
 
+@pytest.mark.parametrize("unit", [2.0, 1e6, jnp.array(3e-4)])
+def test_a_change_of_the_unit_of_time_scales_increments(unit):
+    gaussian = ds.FixedStepBrownianPath((3,), jr.key(0))
+    words = jnp.array([0, 2**30, 2**32 - 1], jnp.uint32)
+    cut = ds.TruncatedBrownianPath(gaussian, k=1).increment(words, 0.0, 0.5)
+    path = ds.TruncatedBrownianPath(gaussian, k=1, unit=unit)
+    same = jax.jit(lambda unit: path.increment(words, 0.0, 0.5 * unit))(unit)
+    np.testing.assert_allclose(same, cut * np.sqrt(unit), rtol=1e-14)
+
+
+@pytest.mark.parametrize("k", [1, 2, 4])
+def test_the_error_in_any_unit_converges_at_the_order_of_the_paper(k):
+    unit = 7.0
+    for h in (1.0, 0.3, 0.1):
+        path = ds.TruncatedBrownianPath(
+            ds.FixedStepBrownianPath((2,), jr.key(0)), k=k, unit=unit
+        )
+        words = jnp.array([0, 2**32 - 1], jnp.uint32)
+        bound = path.increment(words, 0.0, h)[1] / np.sqrt(h)
+        x = np.linspace(bound, bound + 20, 200_001)
+        density = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
+        assert 2 * np.trapezoid((x - bound) ** 2 * density, x) <= (h / unit) ** k
+
+
+@pytest.mark.parametrize("unit", [0.0, -1.0, np.inf, np.nan, jnp.ones(2), "s"])
+def test_the_unit_must_be_a_positive_number(unit):
+    with pytest.raises(ValueError, match="`unit` must be a positive number"):
+        ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((), jr.key(0)), unit=unit)
+
+
 @pytest.mark.parametrize("k", [0, -1, 1.5, True, None])
 def test_truncation_needs_a_positive_integer(k):
     with pytest.raises(ValueError, match="`k` must be a positive integer"):
@@ -68,7 +98,7 @@ def test_truncation_needs_a_path():
 
 def test_nothing_is_left_of_increments_over_long_steps():
     path = ds.TruncatedBrownianPath(diffrax.UnsafeBrownianPath((), jr.key(0)))
-    with pytest.raises(Exception, match="noise is too strong for the step"):
+    with pytest.raises(Exception, match="as long as its `unit`"):
         jax.block_until_ready(jax.jit(lambda t: path.evaluate(0.0, t))(1.0))
 
 

@@ -96,6 +96,18 @@ def test_a_call_with_other_numbers_compiles_nothing(run, sampling, engine):
     assert anew == {}
 
 
+def test_another_unit_of_truncation_compiles_nothing():
+    energy = lambda t, p, q, args: (p**2 + q**2) / 2
+    terms = ds.hamiltonian_terms(energy, lambda t, p, q, args: q**2 / 4, ())
+    y0 = jnp.array(0.0), jnp.array(1.0)
+    for h in (0.125, 0.25):
+        compiled.clear()
+        ds.ensemble(
+            terms, ds.ImplicitMidpoint(), 0, 4 * h, h, y0, key=jr.key(0), num_paths=8
+        )
+    assert compiled == []
+
+
 def test_xla_does_not_know_the_result_before_a_step_of_a_fit():
     """It would evaluate what follows from it for all states while compiling, for more than
     a second with an alarm from `slow_operation_alarm`, where there are many states."""

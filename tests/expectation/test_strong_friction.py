@@ -102,6 +102,73 @@ def test_friction_that_depends_on_positions_masses_and_args_is_that_of_the_start
             assert np.isfinite(got.mean)
 
 
+def _turning(t, q, args):
+    """Friction 10 times as strong along one axis, which turns with the position."""
+    strong, turns = args
+    c, s = jnp.cos(turns * q[0]), jnp.sin(turns * q[0])
+    turn = jnp.array([[c, -s], [s, c]])
+    return strong * turn @ jnp.diag(jnp.array([1.0, 0.1])) @ turn.T
+
+
+def _free(t, p, q, args):
+    return jnp.sum(p**2) / 2
+
+
+PLANE = jnp.zeros(2), jnp.zeros(2)
+
+
+@pytest.mark.parametrize("solver", [ds.BAOAB(), ds.BAOAB(ds.ImplicitMidpoint())])
+def test_friction_that_turns_far_in_a_step_is_told(solver):
+    terms = ds.langevin_terms(_free, _turning, 1.0, (2,))
+
+    def told(strong, turns, h=1.0):
+        args = jnp.array(strong), jnp.array(turns)
+        return _told(terms, solver, h, PLANE, args=args)[1]
+
+    assert told(5.0, 2.0)
+    assert not told(5.0, 0.1)
+    # The same steps for half of the way.
+    assert not told(5.0, 2.0, h=0.1)
+    # Weak friction averages over many directions.
+    assert not told(0.5, 2.0)
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1e6])
+def test_friction_that_turns_is_told_in_any_unit_of_time_and_from_rest(scale):
+    # The thermal velocities are 1 / `scale`: what turns the tensor is the bath alone.
+    def energy(t, p, q, args):
+        return jnp.sum(p**2) / (2 * scale**2)
+
+    terms = ds.langevin_terms(energy, _turning, 1.0, (2,))
+    for turns in (0.1, 2.0):
+        args = jnp.array(5.0 * scale), jnp.array(turns)
+        assert _told(terms, ds.BAOAB(), scale, PLANE, args=args)[1] == (turns > 1)
+
+
+def test_friction_that_changes_its_size_is_told_and_constant_friction_is_not():
+    wall = lambda t, q, args: 5.0 * (1 + args * jnp.tanh(q) ** 2)
+    terms = ds.langevin_terms(_free, wall, 1.0, (2,))
+    assert _told(terms, ds.BAOAB(), 1.0, PLANE, args=jnp.array(10.0))[1]
+    assert not _told(terms, ds.BAOAB(), 1.0, PLANE, args=jnp.array(0.1))[1]
+    # Masses change, and the friction does not.
+    heavier = lambda t, p, q, args: jnp.sum(p**2 * jnp.exp(-3 * q)) / 2
+    terms = ds.langevin_terms(heavier, 5.0, 1.0, (2,))
+    assert not _told(terms, ds.BAOAB(ds.ImplicitMidpoint()), 0.2, PLANE)[1]
+
+
+@pytest.mark.slow
+def test_two_levels_of_friction_that_turns_far_agree_on_a_wrong_diffusion():
+    terms = ds.langevin_terms(_free, _turning, 1.0, (2,))
+    args = jnp.array(5.0), jnp.array(2.4)
+    phi = lambda t, y, args: jnp.sum(y[1] ** 2)
+    start = lambda key: (jr.normal(key, (2,)), jnp.zeros(2))
+    given = dict(key=jr.key(0), sampling=ds.IndependentPaths(2**13))
+    with pytest.warns(UserWarning, match="how the friction changes with positions"):
+        long = ds.expectation(phi, terms, ds.BAOAB(), 0, 40, 1.0, start, args, **given)
+    short = ds.expectation(phi, terms, ds.BAOAB(), 0, 40, 1 / 32, start, args, **given)
+    assert long.mean - 3 * long.error > short.mean + 3 * short.error
+
+
 def test_with_three_levels_the_order_is_checked_instead():
     terms = ds.langevin_terms(_well, 8.0, 1.0, (3,))
     assert _told(terms, ds.SRKw5(), 0.2, REST)[1]

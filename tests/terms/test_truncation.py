@@ -13,6 +13,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import laws_of, lost_variance
+from diffrax_symplectic._simulation import Problem
 from diffrax_symplectic._solver import SOLVERS
 from diffrax_symplectic._terms import brownian_paths, step_variables
 
@@ -165,12 +166,12 @@ def test_the_law_with_additive_noise_is_exact_at_every_step(solver, h):
             assert abs((x**4).mean() - 3) < 5 * (96 / len(x)) ** 0.5
 
 
-def truncated_moments(solver, h):
+def truncated_moments(solver, h, unit=1.0):
     """Second moments after one step with truncated increments, by quadrature: an integral
     between the bounds, and what lies beyond at these."""
     path = ds.FixedStepBrownianPath((), jr.key(0))
     terms = ds.hamiltonian_terms(WELL, SPRING, path)
-    bound = np.sqrt(4 * abs(np.log(h)))
+    bound = np.sqrt(4 * abs(np.log(h / unit)))
     nodes, weights = np.polynomial.legendre.leggauss(60)
     x = np.append(bound * nodes, [-bound, bound])
     inner = bound * weights * np.exp(-((bound * nodes) ** 2) / 2) / np.sqrt(2 * np.pi)
@@ -188,12 +189,25 @@ def truncated_moments(solver, h):
 
 
 @matrix(filter(truncates, IMPLICIT))
-def test_with_multiplicative_noise_what_is_lost_is_said(solver, h):
+def test_with_multiplicative_noise_made_paths_lose_little(solver, h):
+    # One step over the whole interval is the longest of all.
     solver = solver()
-    terms = ds.hamiltonian_terms(WELL, SPRING, ())
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        paths = follow(ds.hamiltonian_terms(WELL, SPRING, ()), solver, h, 1)
+    (path,) = brownian_paths(paths.terms(0))
+    assert isinstance(path, ds.TruncatedBrownianPath)
+    assert path.unit == 32 * h and lost_variance(path, h) < 4e-4
+    assert_moments(paths.ys, truncated_moments(solver, h, 32 * h))
+
+
+@matrix(filter(truncates, IMPLICIT))
+def test_what_paths_of_the_user_lose_with_multiplicative_noise_is_said(solver, h):
+    solver = solver()
     path = solver.path((), jr.key(0), want="strong")
+    terms = ds.hamiltonian_terms(WELL, SPRING, path)
     if h >= 1:
-        with pytest.raises(ValueError, match="noise is too strong for the step"):
+        with pytest.raises(ValueError, match="as long as its `unit`.*unit=32"):
             follow(terms, solver, h, 1)
         return
     with pytest.warns(UserWarning, match="of their variance in steps") as told:
@@ -204,9 +218,61 @@ def test_with_multiplicative_noise_what_is_lost_is_said(solver, h):
 
 
 def test_little_loss_is_not_said():
+    path = MIDPOINT.path((), jr.key(0))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        follow(ds.hamiltonian_terms(WELL, SPRING, ()), MIDPOINT, 0.04, 1, num_paths=10)
+        terms = ds.hamiltonian_terms(WELL, SPRING, path)
+        follow(terms, MIDPOINT, 0.04, 1, num_paths=10)
+        # The advice of the message.
+        wide = ds.TruncatedBrownianPath(path.path, unit=32 * 3.0)
+        terms = ds.hamiltonian_terms(WELL, SPRING, wide)
+        follow(terms, MIDPOINT, 3.0, 1, num_paths=10)
+
+
+def in_ticks(ticks):
+    """The oscillator whose unit of time holds this many ticks, in ticks."""
+    energy = lambda t, p, q, args: WELL(t, p, q, args) / ticks
+    noise = lambda t, p, q, args: SPRING(t, p, q, args) / ticks**0.5
+    return ds.hamiltonian_terms(energy, noise, ())
+
+
+@pytest.mark.parametrize("levels", [1, 2])
+def test_means_are_the_same_numbers_in_every_unit_of_time(levels):
+    # Sorted paths take their random words by the number of a step, not by its times. The
+    # kink asks for Gaussian increments.
+    def mean(ticks):
+        return ds.expectation(
+            lambda t, y, args: jnp.abs(y[1]), in_ticks(ticks), MIDPOINT,
+            0, 2 * ticks, 0.2 * ticks, ONE, key=jr.key(0), levels=levels,
+            sampling=ds.ArrayRQMC(2**8, 2), ts=[1 * ticks, 2 * ticks],
+        )  # fmt: skip
+
+    for ticks in (1e3, 1e-3):
+        np.testing.assert_allclose(mean(ticks).mean, mean(1.0).mean, rtol=1e-12)
+        np.testing.assert_allclose(mean(ticks).error, mean(1.0).error, rtol=1e-9)
+
+
+@pytest.mark.parametrize("ticks", [1e-6, 1e3, 1e6])
+def test_laws_with_multiplicative_noise_are_exact_in_every_unit_of_time(ticks):
+    h = 0.02
+    path = ds.FixedStepBrownianPath((), jr.key(0))
+    terms = ds.hamiltonian_terms(WELL, SPRING, path)
+    exact = exact_moments(terms, MIDPOINT, h, 50)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        paths = follow(in_ticks(ticks), MIDPOINT, h * ticks, 50)
+    assert paths.num_failed == 0
+    assert_moments(paths.ys, exact)
+
+
+def test_all_levels_truncate_in_the_same_unit():
+    problem = Problem.of(
+        lambda t, y, args: y[1], in_ticks(1.0), MIDPOINT, 1.0, 3.0, 0.5, ONE, None, None,
+        levels=3, want="strong",
+    )  # fmt: skip
+    (path,) = brownian_paths(problem.terms)
+    assert isinstance(path, ds.TruncatedBrownianPath)
+    assert path.unit == 64.0
 
 
 def test_a_bath_is_as_hot_where_phi_has_kinks():

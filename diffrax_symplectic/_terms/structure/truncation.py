@@ -3,7 +3,8 @@
 from collections.abc import Sequence
 
 import diffrax
-from jaxtyping import PyTree
+import numpy as np
+from jaxtyping import Float, PyTree
 
 from ..._brownian import TruncatedBrownianPath
 from ..._compat import unwrapped
@@ -51,6 +52,24 @@ def without_truncation(
         is_wanted = next(remaining_flags)
         if is_wanted and isinstance(path, TruncatedBrownianPath):
             return path.path
+        return path
+
+    return replace_paths(terms, new_path)
+
+
+def truncated_in_unit(
+    terms: PyTree[diffrax.AbstractTerm],
+    which: Sequence[bool],
+    unit: Float[np.ndarray, ""],
+) -> PyTree[diffrax.AbstractTerm]:
+    """The terms with this `unit` of time in those truncated paths whose flag in `which`,
+    with one for each path, is true."""
+    remaining_flags = iter(which)
+
+    def new_path(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
+        is_wanted = next(remaining_flags)
+        if is_wanted and isinstance(path, TruncatedBrownianPath):
+            return TruncatedBrownianPath(path.path, k=path.k, unit=unit)
         return path
 
     return replace_paths(terms, new_path)
