@@ -1,6 +1,7 @@
 """The step of friction and noise at fixed positions, by the implicit midpoint rule."""
 
 import functools as ft
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -115,18 +116,10 @@ def after_friction(
 
     if kick is None:
         kick = jtu.tree_map(jnp.zeros_like, p)
-    # In both cases below, F(p + x / 2) = F(p) + S x / 2 with the slope S of F, so that
+    # F(p + x / 2) = F(p) + S x / 2 with the slope S of F, so that
     # (1 - h S / 2) x = h F(p) + B W.
     if acts_elementwise(force, p):
-        # One equation for each momentum, whose slope is the derivative along ones.
-        ones = jtu.tree_map(jnp.ones_like, p)
-        forces, slopes = jax.jvp(force, (p,), (ones,))
-
-        def moved(p: Array, force: Array, slope: Array, kick: Array) -> Array:
-            step_size = jnp.asarray(h, jnp.result_type(p))
-            return p + (step_size * force + kick) / (1 - step_size / 2 * slope)
-
-        return jtu.tree_map(moved, p, forces, slopes, kick)
+        return _after_own_friction(force, h, p, kick)
     flat_p, unravel = jfu.ravel_pytree(p)
     flat_kick, _ = jfu.ravel_pytree(kick)
 
@@ -145,6 +138,25 @@ def after_friction(
     # Elimination in XLA operations takes a tenth of LAPACK's time for matrices this small.
     solve = eliminate if flat_p.size <= MAX_WRITTEN_OUT else jnp.linalg.solve
     return unravel(flat_p + solve(matrix, rhs))
+
+
+def _after_own_friction(
+    force: Callable[[PyTree[Array]], PyTree[Array]],
+    h: RealScalarLike,
+    p: PyTree[Array],
+    kick: PyTree[Array],
+) -> PyTree[Array]:
+    """`after_friction` where the `force` on each momentum depends on this momentum alone:
+    one equation each."""
+    # The slopes are the derivative along ones.
+    ones = jtu.tree_map(jnp.ones_like, p)
+    forces, slopes = jax.jvp(force, (p,), (ones,))
+
+    def after_step(p: Array, force: Array, slope: Array, kick: Array) -> Array:
+        step_size = jnp.asarray(h, jnp.result_type(p))
+        return p + (step_size * force + kick) / (1 - step_size / 2 * slope)
+
+    return jtu.tree_map(after_step, p, forces, slopes, kick)
 
 
 class _Matrices(NamedTuple):

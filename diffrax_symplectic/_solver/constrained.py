@@ -30,7 +30,7 @@ from .._terms import (
 from .base import AbstractSymplecticSolver
 from .bath import after_friction
 from .driven import drawn_variables, drift_change
-from .flow import begin_flow, Flow, forces_at_start, kicks_and_rest, moved_by
+from .flow import after_flow, begin_flow, Flow, forces_at_start, kicks_and_rest
 from .step import no_failure
 
 
@@ -158,7 +158,7 @@ def baoab_step(
             p, q, found = surface.free_flight(p, normal_space, half, pending)
             return _AfterFlow(p, q, flow_state, found)
         y = (unravel_p(p), unravel_q(normal_space.q))
-        y, flow_state, result = moved_by(
+        y, flow_state, result = after_flow(
             flow, steps, rest, begin, end, half, y, args, flow_state
         )
         (p, _), (q, _) = map(jfu.ravel_pytree, y)

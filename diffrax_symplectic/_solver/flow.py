@@ -133,7 +133,7 @@ def begin_flow(
     return flow.init(diffrax.MultiTerm(*drift), t0, t1, y0, args)  # pyright: ignore
 
 
-def moved_by(
+def after_flow(
     flow: Flow,
     steps: int,
     drift: Terms,
@@ -150,23 +150,37 @@ def moved_by(
         p, q = y
         _, velocities = rate(drift, t0, y, args)
         return (p, moved(q, time, velocities)), None, diffrax.RESULTS.successful
-    if not is_solver(flow):
-        # Steps are positive even in a solve backward in time, where the flow runs back.
-        y1 = flow(direction(drift) * time, y, args)  # pyright: ignore
-        R: Any = diffrax.RESULTS
-        # The state of a function is whether it returned NaN at the start.
-        result = R.where(state, R.nonfinite, result_of(None, y1))
-        return y1, state, result
+    if is_solver(flow):
+        return _after_steps(flow, steps, drift, t0, t1, y, args, state)
+    # Steps are positive even in a solve backward in time, where the flow runs back.
+    y1 = flow(direction(drift) * time, y, args)  # pyright: ignore
+    R: Any = diffrax.RESULTS
+    # The state of a function is whether it returned NaN at the start.
+    result = R.where(state, R.nonfinite, result_of(None, y1))
+    return y1, state, result
+
+
+def _after_steps(
+    solver: Any,
+    steps: int,
+    drift: Terms,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    y: Y,
+    args: Args,
+    state: PyTree[Array],
+) -> tuple[Y, PyTree[Array], diffrax.RESULTS]:
+    """`after_flow` for a solver, which goes from `t0` to `t1` in this many steps."""
     terms = diffrax.MultiTerm(*drift)
     h = (t1 - t0) / steps
 
-    def step(carry: tuple[Any, ...], number: Any) -> tuple[tuple[Any, ...], None]:
+    def step(carry: tuple[Any, ...], index: Any) -> tuple[tuple[Any, ...], None]:
         y, state, _ = carry
-        begin = t0 + number * h
+        step_start = t0 + index * h
         # What the bath did is a jump for a solver that remembers the end of its last step.
         made_jump = True
-        y, _, _, state, result = flow.step(  # pyright: ignore
-            terms, begin, begin + h, y, args, state, made_jump
+        y, _, _, state, result = solver.step(
+            terms, step_start, step_start + h, y, args, state, made_jump
         )
         return (y, state, result), None
 

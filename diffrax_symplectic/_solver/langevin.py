@@ -25,6 +25,7 @@ from .bath import after_friction, check_friction
 from .constrained import baoab_step, begin_baoab
 from .driven import drawn_variables
 from .flow import (
+    after_flow,
     begin_flow,
     check_flow,
     check_follows,
@@ -33,7 +34,6 @@ from .flow import (
     is_solver,
     kicks_and_rest,
     moved,
-    moved_by,
 )
 from .record import Record
 from .step import result_of
@@ -143,7 +143,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         elif kicks:
             p = moved(p, h, compute_forces())
         # Flow. Of the rates at (p, q) only the velocities are used; XLA drops the forces.
-        follow = ft.partial(moved_by, self.flow, self.steps, rest)
+        follow = ft.partial(after_flow, self.flow, self.steps, rest)
         (p, q), flow_state, _ = follow(t0, middle, half, (p, q), args, flow_state)
         # Friction and noise
         kick = None
