@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._solver import LANGEVIN
 
 from ..families import slow_except
 
@@ -20,18 +21,18 @@ SOLVERS = [
     ds.StormerVerlet(),
     ds.ImplicitMidpoint(),
     ds.NinomiyaVictoir(),
-    ds.BAOAB(),
     ds.BAOAB(ds.StormerVerlet()),
+    *(kind() for kind in LANGEVIN),
 ]
 # Of the places where times are checked, two: separable steps and steps with friction.
 each = pytest.mark.parametrize(
-    "solver", slow_except([SOLVERS[0], SOLVERS[3]], SOLVERS), ids=repr
+    "solver", slow_except([SOLVERS[0], SOLVERS[4]], SOLVERS), ids=repr
 )
 
 
 def _oscillator(path, solver=None):
     H0 = lambda t, p, q, args: p**2 / 2 + q**2 / 2
-    if isinstance(solver, ds.BAOAB):
+    if isinstance(solver, LANGEVIN):
         return ds.langevin_terms(H0, 0.1, 0.05, path)
     return ds.hamiltonian_terms(H0, lambda t, p, q, args: 0.1 * q, path)
 
