@@ -130,7 +130,14 @@ class Recorded(diffrax.AbstractBrownianPath):
 RECORD = Recorded(jnp.cumsum(0.3 * jr.normal(jr.key(0), (11,))))
 
 
-@each
+# A record has increments alone.
+@pytest.mark.parametrize(
+    "solver",
+    slow_except(
+        [SOLVERS[0], SOLVERS[4]], [x for x in SOLVERS if x.variables == ("W",)]
+    ),
+    ids=repr,
+)
 def test_beyond_the_end_of_recorded_noise_there_is_an_error(solver):
     @eqx.filter_jit
     def run(t0, t1):
