@@ -496,10 +496,10 @@ def _steps_without_inverse() -> str:
     "`BAOAB` with rate of friction times step equal to 2"."""
     # The zero of `area_factor`: its x is the rate times the step over 2 `friction_parts`.
     return " or of ".join(
-        f"`{kind.__name__}` with rate of friction times step equal to "
-        f"{2 * kind.friction_parts}"
-        for kind in LANGEVIN
-        if kind().undoes_its_steps
+        f"`{type(solver).__name__}` with rate of friction times step equal to "
+        f"{2 * solver.friction_parts}"
+        for solver in (kind() for kind in LANGEVIN)
+        if solver.undoes_its_steps
     )
 
 

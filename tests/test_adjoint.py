@@ -79,7 +79,7 @@ def test_solvers_that_the_docstring_names_undo_their_steps():
     assert len(named) > 5
     assert named <= {type(solver).__name__ for solver in REVERSIBLE}
     x = 0.3
-    assert ds.BAOAB.area_factor(2 * x) == (1 - x) / (1 + x)
+    assert ds.BAOAB().area_factor(2 * x) == (1 - x) / (1 + x)
     assert (
         "BAOAB`][] by $|(1 + x) / (1 - x)|$ in each step, $x = \\gamma h / 2$" in text
     )

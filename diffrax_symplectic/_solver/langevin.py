@@ -65,19 +65,22 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
 
     variables: ClassVar[tuple[str, ...]] = ("W",)
     symmetric: AbstractClassVar[bool]
-    # How many parts of a step are friction and noise, each over an equal share of it.
-    friction_parts: ClassVar[int] = 1
     flow: AbstractVar[Flow]
     # The steps of a solver over half a flow.
     steps: AbstractVar[int]
 
-    @classmethod
-    def area_factor(cls, rate_times_step: ArrayLike) -> Any:
+    @property
+    def friction_parts(self) -> int:
+        """How many parts of a step are friction and noise, each over an equal share of
+        it."""
+        return 1
+
+    def area_factor(self, rate_times_step: ArrayLike) -> Any:
         """The factor by which a step shrinks areas, where friction is one rate for all
         momenta. At zero a step has no inverse."""
         # Each part is the midpoint rule for friction over its share of the step.
-        x = rate_times_step / (2 * cls.friction_parts)
-        return ((1 - x) / (1 + x)) ** cls.friction_parts
+        x = rate_times_step / (2 * self.friction_parts)
+        return ((1 - x) / (1 + x)) ** self.friction_parts
 
     def stage_vectors(self, num_noises):
         if not is_solver(self.flow):

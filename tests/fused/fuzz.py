@@ -19,6 +19,7 @@ import jax.random as jr
 import numpy as np
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._solver import LANGEVIN
 
 from ..picard import by_picard
 from .functions import FUNCTIONS
@@ -147,7 +148,7 @@ def apart(case: Case) -> float:
     )
     path = path(jax.ShapeDtypeStruct((), case.dtype), jr.key(0))
     terms = ds.hamiltonian_terms(H0, H1, path)
-    if isinstance(case.solver, ds.BAOAB):
+    if isinstance(case.solver, LANGEVIN):
         terms = diffrax.MultiTerm(*terms.terms, *ds.bath_terms(H0, 0.3).terms)
     atol = 1e-15 if case.dtype == jnp.float64 else 1e-6
     y0 = jax.tree.map(jnp.zeros_like, y), y

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._solver import LANGEVIN
 from examples.hard_cases import double_well
 from examples.hard_cases._ensemble import gaussian
 from examples.hard_cases._stationary import stationary_bias, Step
@@ -77,13 +78,17 @@ def test_momenta_of_baoab_are_too_cold_by_a_known_factor(h):
     np.testing.assert_allclose(moments, exact, rtol=1e-13, atol=1e-14)
 
 
-BOTH_SPLITTINGS = pytest.mark.parametrize("solver", [ds.BAOAB(), ds.LangevinMiddle()])
+SPLITTINGS = [kind() for kind in LANGEVIN]
+each_splitting = pytest.mark.parametrize("solver", SPLITTINGS, ids=repr)
+# Those with the whole bath in the middle of free flight.
+EXACT_POSITIONS = [x for x in SPLITTINGS if "qq" in x.record.stationary]
+with_exact_positions = pytest.mark.parametrize("solver", EXACT_POSITIONS, ids=repr)
 
 
 BOTH = [(friction, masses) for friction in FRICTIONS for masses in KINETIC]
 
 
-@BOTH_SPLITTINGS
+@with_exact_positions
 @pytest.mark.parametrize(
     "kinds",
     slow_except([("number", "each"), ("matrix", "matrix")], BOTH),
@@ -99,12 +104,12 @@ def test_springs_of_any_friction_and_masses_keep_the_temperature(kinds, solver):
     np.testing.assert_allclose(moments[3:, 3:] @ springs, T * np.eye(3), atol=1e-13)
     M = {"number": np.eye(3), "each": np.diag(MASSES), "matrix": MASS_MATRIX}[masses]
     momenta = T * np.asarray(M)
-    if isinstance(solver, ds.BAOAB):
+    if "pp" not in solver.record.stationary:
         momenta = momenta - T * springs * h**2 / 4
     np.testing.assert_allclose(moments[:3, :3], momenta, atol=1e-13)
 
 
-@BOTH_SPLITTINGS
+@with_exact_positions
 @pytest.mark.parametrize("friction", slow_except(["matrix"], FRICTIONS))
 def test_free_particles_diffuse_as_einstein_says_for_any_step(friction, solver):
     G = FRICTIONS[friction]
@@ -125,7 +130,7 @@ def test_free_particles_diffuse_as_einstein_says_for_any_step(friction, solver):
         np.testing.assert_allclose(grown / (2 * h), exact, rtol=1e-10, atol=1e-11)
 
 
-@BOTH_SPLITTINGS
+@with_exact_positions
 def test_mobility_is_exact(solver):
     force, h = 0.3, 1.5
     H0 = lambda t, p, q, args: p**2 / (2 * MASS) - force * q
@@ -314,9 +319,9 @@ def _diffrax_terms(path, gamma=GAMMA):
     )
 
 
-@BOTH_SPLITTINGS
+@each_splitting
 def test_terms_of_diffrax_are_taken_as_they_are(solver):
-    path = weak_path(2)
+    path = solver.path((2,), jr.key(0), want="weak")
     H0 = lambda t, p, q, args: jnp.sum(U * p**2 / 2 + q**4 / 4 - args * jnp.cos(q))
     ours = ds.langevin_terms(H0, GAMMA / U, 1.0, path)
     x, v = jr.normal(jr.key(1), (2, 2))

@@ -9,6 +9,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._adjoint import _undoes_its_steps
+from diffrax_symplectic._solver import LANGEVIN
 
 from ..problems import Given, orders_of_a_splitting, weak_path
 from . import klein_gordon
@@ -220,7 +221,8 @@ BATH = r"`BAOAB\(linear_flow\(\.\.\.\)\)`.*`langevin_terms\(.*slow="
 
 def test_heat_baths_are_refused_in_favour_of_baoab():
     flow, y0 = klein_gordon.waves(8, 0.1), (jnp.ones(8), jnp.ones(8))
-    for langevin in (ds.BAOAB(), ds.LangevinMiddle(), ds.BAOAB(ds.StormerVerlet())):
+    baths = [*(kind() for kind in LANGEVIN), ds.BAOAB(ds.StormerVerlet())]
+    for langevin in baths:
         with pytest.raises(ValueError, match=BATH):
             ds.LinearFlow(langevin, flow)
     kinetic = lambda t, p, q, args: jnp.sum(p**2) / 2

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._solver import LANGEVIN
 
 from ..families import slow_except
 
@@ -20,18 +21,18 @@ SOLVERS = [
     ds.StormerVerlet(),
     ds.ImplicitMidpoint(),
     ds.NinomiyaVictoir(),
-    ds.BAOAB(),
     ds.BAOAB(ds.StormerVerlet()),
+    *(kind() for kind in LANGEVIN),
 ]
 # Of the places where times are checked, two: separable steps and steps with friction.
 each = pytest.mark.parametrize(
-    "solver", slow_except([SOLVERS[0], SOLVERS[3]], SOLVERS), ids=repr
+    "solver", slow_except([SOLVERS[0], SOLVERS[4]], SOLVERS), ids=repr
 )
 
 
 def _oscillator(path, solver=None):
     H0 = lambda t, p, q, args: p**2 / 2 + q**2 / 2
-    if isinstance(solver, ds.BAOAB):
+    if isinstance(solver, LANGEVIN):
         return ds.langevin_terms(H0, 0.1, 0.05, path)
     return ds.hamiltonian_terms(H0, lambda t, p, q, args: 0.1 * q, path)
 
@@ -129,7 +130,14 @@ class Recorded(diffrax.AbstractBrownianPath):
 RECORD = Recorded(jnp.cumsum(0.3 * jr.normal(jr.key(0), (11,))))
 
 
-@each
+# A record has increments alone.
+@pytest.mark.parametrize(
+    "solver",
+    slow_except(
+        [SOLVERS[0], SOLVERS[4]], [x for x in SOLVERS if x.variables == ("W",)]
+    ),
+    ids=repr,
+)
 def test_beyond_the_end_of_recorded_noise_there_is_an_error(solver):
     @eqx.filter_jit
     def run(t0, t1):

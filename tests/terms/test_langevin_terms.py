@@ -354,3 +354,29 @@ def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
     ):
         with pytest.raises(ValueError, match=match):
             ds.BAOAB().init(make(*arguments), 0.0, 0.1, y0, None)
+
+
+@pytest.mark.parametrize("shape", [(4,), (4, 1)])
+def test_one_value_for_each_particle_is_told_how_to_be_repeated(shape):
+    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2
+    y0 = jnp.zeros((4, 3)), jnp.zeros((4, 3))
+    each = jnp.arange(1.0, 5.0).reshape(shape)
+    axes = "[:, None]" if shape == (4,) else ""
+
+    def solve(friction, temperature):
+        terms = ds.langevin_terms(
+            H0, friction, temperature, ds.WeakBrownianPath((4, 3), jr.key(0))
+        )
+        return diffrax.diffeqsolve(terms, ds.BAOAB(), 0.0, 0.2, 0.1, y0).ys
+
+    def advice(name):
+        return re.escape(f"`{name}{axes} * jnp.ones((4, 3))`")
+
+    for given in (each, lambda t, q, args: each):
+        with pytest.raises(ValueError, match=advice("friction")):
+            solve(given, 1.0)
+        with pytest.raises(ValueError, match=advice("temperature")):
+            solve(1.0, given)
+    # What the message says.
+    repeated = (each[:, None] if axes else each) * jnp.ones((4, 3))
+    assert np.all(np.isfinite(solve(repeated, repeated)))

@@ -395,3 +395,37 @@ def test_a_check_of_the_users_does_not_stop_the_advice():
     terms = ds.hamiltonian_terms(lambda t, p, q, args: jnp.sum(p * q), noise, path)
     assert not noises_commute((terms.terms[1],), 0.0, _positive_state, None)
     assert len(ds.suggest_solver(terms, 0.0, _positive_state, want="strong")) > 0
+
+
+def _speed(p):
+    return p / jnp.sqrt(1 + jnp.sum(p**2))
+
+
+def test_a_force_that_is_no_gradient_is_a_term_of_its_own_and_the_message_says_so():
+    # An active particle, pushed along its momentum: hidden from derivatives, an assertion
+    # would pass the check at `y0`, and the step would be wrong.
+    kinetic = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2
+    push = lambda p, q: q @ jax.lax.stop_gradient(_speed(p))
+    pushed = lambda t, p, q, args: kinetic(t, p, q, args) - push(p, q)
+    path, y0 = ds.WeakBrownianPath((2,), jr.key(0)), (jnp.ones(2), jnp.zeros(2))
+
+    def solve(terms, solver):
+        return diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0).ys
+
+    own_term = r"no part of H0, and no `structure` makes it one: add it as a term"
+    with pytest.raises(ValueError, match=own_term):
+        solve(ds.langevin_terms(pushed, 1.0, 1.0, path), ds.BAOAB())
+    # What the message says.
+    terms = ds.langevin_terms(kinetic, 1.0, 1.0, path)
+    along_p = diffrax.ODETerm(lambda t, y, args: (_speed(y[0]), jnp.zeros(2)))
+    swirl = diffrax.ODETerm(
+        lambda t, y, args: (jnp.stack([-y[1][1], y[1][0]]), jnp.zeros(2))
+    )
+    midpoint = ds.ImplicitMidpoint()
+    for own, solver in ((along_p, ds.BAOAB(midpoint)), (swirl, ds.BAOAB())):
+        both = diffrax.MultiTerm(*terms.terms, own)
+        np.testing.assert_allclose(
+            solve(both, solver), solve(both, midpoint), atol=0.02
+        )
+    with pytest.raises(ValueError, match=r"takes such a term, and so does `BAOAB\(Imp"):
+        solve(diffrax.MultiTerm(*terms.terms, along_p), ds.BAOAB())

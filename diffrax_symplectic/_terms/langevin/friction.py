@@ -209,10 +209,20 @@ def _broadcast_advice(
     name: str, shape: tuple[int, ...], momenta_shape: tuple[int, ...]
 ) -> str:
     """What to pass instead of an array of this shape if NumPy would broadcast it, which is
-    not done here: the shape of a matrix and that of momenta could not be told apart."""
-    if not _broadcasts(shape, momenta_shape):
-        return ""
-    return f" To repeat it along an axis, pass `{name} * jnp.ones({momenta_shape})`."
+    not done here: the shape of a matrix and that of momenta could not be told apart. Also
+    if it has one value for each particle, the first axis of the momenta."""
+    advice = ""
+    if len(momenta_shape) > 1 and shape == momenta_shape[:1]:
+        axes = ", ".join([":"] + ["None"] * (len(momenta_shape) - 1))
+        advice += (
+            " If it has one value for each particle, pass "
+            f"`{name}[{axes}] * jnp.ones({momenta_shape})`."
+        )
+    if _broadcasts(shape, momenta_shape):
+        advice += (
+            f" To repeat it along an axis, pass `{name} * jnp.ones({momenta_shape})`."
+        )
+    return advice
 
 
 def _broadcasts(shape: tuple[int, ...], momenta_shape: tuple[int, ...]) -> bool:
@@ -239,6 +249,7 @@ def _check_fits_path(friction: ArrayLike, path_shape: tuple[int, ...]) -> None:
         f"shape {momenta_shape} pass a path of shape {momenta_shape}, one noise for each "
         f"momentum. For momenta of shape {path_shape} pass friction of that shape, or a "
         f"matrix of shape {path_shape * 2}."
+        f"{_broadcast_advice('friction', shape, path_shape)}"
     )
 
 

@@ -21,6 +21,7 @@ from ..dependence import Dependence
 from ..drift_and_noise import control_struct, split_terms
 from ..langevin import friction_apart, split_friction
 from ..lifted import has_lifted
+from ..paths import brownian_paths
 from ..symplectic_gradients import (
     asserted_structure,
     AssertedStructure,
@@ -39,6 +40,12 @@ _GENERAL = (
 _GENERAL_BATH = (
     "use `BAOAB(ImplicitMidpoint())`, for any H0 that is quadratic in p, or a solver for "
     "general systems, such as `ImplicitMidpoint`"
+)
+_NO_GRADIENT = (
+    "A force that is not the gradient of a potential, as of an active particle, is no part "
+    "of H0, and no `structure` makes it one: add it as a term of its own, `diffrax."
+    "MultiTerm(*terms.terms, diffrax.ODETerm(lambda t, y, args: (force, zeros)))`, which "
+    "`BAOAB()` takes for a force of t and q, and `BAOAB(ImplicitMidpoint())` for any."
 )
 FRICTION = (
     "Take friction from `langevin_terms(H0, friction, temperature, path)`: solvers for "
@@ -454,8 +461,16 @@ def _advice(structure: AssertedStructure, term: diffrax.AbstractTerm) -> str:
     else:
         assertion = f', or pass `structure="{structure}"` to `{maker_name}`'
     general = _GENERAL_BATH if maker_name == "langevin_terms" else _GENERAL
+    is_drift = len(brownian_paths(term)) == 0
+    if is_drift and not is_hamiltonian(term):
+        return (
+            "Variables also count if they cancel or are multiplied by zero: write zeros as "
+            "`jnp.zeros_like(q)`. `ImplicitMidpoint` takes such a term, and so does "
+            "`BAOAB(ImplicitMidpoint())` beside the friction of `langevin_terms`."
+        )
+    no_gradient = f" {_NO_GRADIENT}" if maker_name == "langevin_terms" else ""
     return (
         "Variables also count if they cancel, are multiplied by zero, are printed, or "
         f"share an array with others: in that case write {form}{assertion}. Otherwise "
-        f"{general}."
+        f"{general}.{no_gradient}"
     )
