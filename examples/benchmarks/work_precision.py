@@ -277,26 +277,24 @@ def measured_seconds() -> dict[str, dict]:
 def draw(kind: str, kept: dict) -> None:
     """Errors against seconds, a panel for each model. A point that is not clear of its own
     error bar is not drawn: it says nothing."""
-    figure, axes = plt.subplots(3, 2, figsize=(WIDTH, 9.5))
-    entries = {}
-    for ax, model in zip(axes.flat, STRONG):
+    figure, axes = plt.subplots(len(STRONG), figsize=(WIDTH, 2.6 * len(STRONG)))
+    for ax, model in zip(axes, STRONG):
+        entries = {}
         for name, fields in kept["errors"][kind][model].items():
             e = Errors._make(np.array(fields))
             seconds = kept["seconds"][kind][model][name] / e.hs
             clear = e.errors > 3 * e.std_errors
             bars = 3 * e.std_errors[clear]
-            entries[name] = ax.errorbar(
+            curve, *_ = ax.errorbar(
                 seconds[clear], e.errors[clear], bars, **style(name)
             )
-        ax.set(xscale="log", yscale="log", title=model)
-    # Those below which there is no other panel.
-    for ax in axes.flat[-3:-1]:
-        ax.set_xlabel("CPU seconds per path")
-    for ax in axes[:, 0]:
-        ax.set_ylabel(f"{kind} error")
-    axes[-1, -1].axis("off")
-    names = sorted(entries)
-    axes[-1, -1].legend([entries[name] for name in names], names, loc="center")
+            entries[name] = curve
+        ax.set(xscale="log", yscale="log", title=model, ylabel=f"{kind} error")
+        # Without their bars, which hide markers.
+        names = sorted(entries)
+        handles = [entries[name] for name in names]
+        ax.legend(handles, names, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    axes[-1].set_xlabel("CPU seconds per path")
     figure.savefig(DOCS / f"work_precision_{kind}.png")
     plt.close(figure)
 
