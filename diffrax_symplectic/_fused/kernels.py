@@ -11,7 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
-from .._compat import frozen, variable_number
+from .._compat import frozen_function, variable_number
 from .._custom_types import RealScalarLike
 from .._stablehlo import (
     array_in_memory,
@@ -97,8 +97,8 @@ class Kernels:
         self._is_moving = self._moving_arrays()
         self._constants = self._step.replay.constants()
         self._compiled_solver_state = jax.jit(self._solver_state_at_start)
-        self._make_keys = frozen(self._record_keys, _MOST_RECORDINGS)
-        self._take_steps = frozen(self._record_steps, _MOST_RECORDINGS)
+        self._make_keys = frozen_function(self._record_keys, _MOST_RECORDINGS)
+        self._take_steps = frozen_function(self._record_steps, _MOST_RECORDINGS)
 
     def _moving_arrays(self) -> list[bool]:
         """For each array of the solver state, whether each path has its own. If all paths
