@@ -235,7 +235,7 @@ def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
 def _steps_between(times: StepTimes, num_checkpoints: int) -> IntScalarLike:
     """The number of steps between two checkpoints."""
     # The quotient is rounded up, so that the checkpoints suffice for all steps.
-    return jnp.maximum(1, -(-jnp.asarray(times.number()) // num_checkpoints))
+    return jnp.maximum(1, -(-jnp.asarray(times.num_steps()) // num_checkpoints))
 
 
 def _while_loop_with_checkpoints(

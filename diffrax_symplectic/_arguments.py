@@ -105,8 +105,10 @@ def whole_number(name: str, value: Any, least: int = 1) -> int:
     # `True` is an integer to Python.
     is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not is_integer or value < least:
-        kind = "a positive integer" if least == 1 else f"an integer, {least} or larger"
-        raise ValueError(f"`{name}` must be {kind}; got {value!r}.")
+        expected = "a positive integer"
+        if least != 1:
+            expected = f"an integer, {least} or larger"
+        raise ValueError(f"`{name}` must be {expected}; got {value!r}.")
     return int(value)
 
 
@@ -130,17 +132,17 @@ def _is_real(dtype: Any) -> bool:
     return any(jnp.issubdtype(dtype, kind) for kind in kinds)
 
 
-def real_array(name: str, value: Any, *, kind: str) -> ArrayLike:
-    """The value of the argument of this name. Raises a `ValueError` unless it is a real
-    number or array that is finite and not negative, as far as its values are known while
-    tracing. `kind` says what it must be, such as "a number"."""
+def checked_not_negative(name: str, value: Any, *, expected: str) -> ArrayLike:
+    """The value of the argument of this name, unchanged. Raises a `ValueError` unless it is
+    a real number or array that is finite and not negative, as far as its values are known
+    while tracing. `expected` is for the message, such as "a number"."""
     is_allowed = is_real_number(value)
     if is_allowed and not is_traced(value):
         values = np.asarray(value)
         is_allowed = np.all(np.isfinite(values) & (values >= 0))
     if not is_allowed:
         raise ValueError(
-            f"`{name}` must be {kind}, finite and not negative; got {brief(value)}."
+            f"`{name}` must be {expected}, finite and not negative; got {brief(value)}."
         )
     return value
 

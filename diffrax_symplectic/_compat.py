@@ -108,7 +108,7 @@ def _quick_options() -> dict[str, bool]:
     return options
 
 
-def computed_by(
+def linear_solution(
     solver: lx.AbstractLinearSolver[Any],
     operator: lx.AbstractLinearOperator,
     rhs: Array,
@@ -127,8 +127,9 @@ def unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
     return term.term if isinstance(term, WrapTerm) else term
 
 
-def replaced(term: diffrax.AbstractTerm, new: diffrax.AbstractTerm) -> Any:
-    """`new` in place of the user's term, in the same direction of time."""
+def wrapped_like(term: diffrax.AbstractTerm, new: diffrax.AbstractTerm) -> Any:
+    """`new` in the place of a term that Diffrax may have wrapped, in the same direction of
+    time."""
     return WrapTerm(new, term.direction) if isinstance(term, WrapTerm) else new
 
 
@@ -156,10 +157,10 @@ def direction(terms: PyTree[diffrax.AbstractTerm]) -> Any:
 def reversed_in_time(terms: PyTree[diffrax.AbstractTerm]) -> PyTree:
     """The terms of a solve with the direction of time reversed."""
 
-    def turned(term: Any) -> Any:
+    def reversed_term(term: Any) -> Any:
         return WrapTerm(term.term, -term.direction) if _is_wrapped(term) else term
 
-    return jtu.tree_map(turned, terms, is_leaf=_is_wrapped)
+    return jtu.tree_map(reversed_term, terms, is_leaf=_is_wrapped)
 
 
 def _is_wrapped(x: Any) -> bool:
@@ -196,10 +197,11 @@ def programs_in(eqn: JaxprEqn) -> list[Jaxpr]:
     return [getattr(x, "jaxpr", x) for x in leaves if is_program(x)]
 
 
-def bound(eqn: JaxprEqn, args: Sequence[Any], params: Any) -> list[Any]:
+def results_of_operation(eqn: JaxprEqn, args: Sequence[Any], params: Any) -> list[Any]:
     """The results of one operation of a jaxpr, with these parameters."""
     params = eqn.primitive.get_bind_params(params)
-    # Other versions of JAX return functions apart from what they are passed with.
+    # Some versions of JAX return a pair: functions, which come first among the arguments,
+    # and the other parameters.
     functions, params = params if isinstance(params, tuple) else ((), params)
     with eqn.ctx.manager:
         outs = eqn.primitive.bind(*functions, *args, **params)
@@ -209,8 +211,8 @@ def bound(eqn: JaxprEqn, args: Sequence[Any], params: Any) -> list[Any]:
 def has_blocking_lapack() -> bool:
     """Whether calls of LAPACK that run at the same time can block each other, as on CPUs by
     the versions of JAX that share out a batch in the pool from which they are called."""
-    among_them = (0, 10, 0) <= jax.__version_info__ < (0, 11, 2)
-    return among_them and jax.default_backend() == "cpu"
+    shares_out_batches = (0, 10, 0) <= jax.__version_info__ < (0, 11, 2)
+    return shares_out_batches and jax.default_backend() == "cpu"
 
 
 def stablehlo_module(program: Any) -> Any:
@@ -234,7 +236,7 @@ def variable_number(x: Any) -> int:
     return x.index
 
 
-def frozen(fn: Callable, most_recordings: int) -> Any:
+def frozen_function(fn: Callable, most_recordings: int) -> Any:
     """A function of arrays of Dr.Jit that is recorded once for each combination of types
     and layouts of its arguments. Warns if that happens more often than this."""
     drjit = importlib.import_module("drjit")
@@ -269,9 +271,9 @@ def solve_state(loop_state: Any) -> SolveState:
 def without_derivatives(loop_state: Any, of_solver_state: Callable) -> Any:
     """A state of Diffrax's loop without the state of the equation, and with
     `of_solver_state(x)` in place of each leaf `x` of the solver's state."""
-    fixed = jtu.tree_map(of_solver_state, loop_state.solver_state)
+    solver_state = jtu.tree_map(of_solver_state, loop_state.solver_state)
     # An object that is no array, so that using it by mistake is an error.
-    return dataclasses.replace(loop_state, y=object(), solver_state=fixed)
+    return dataclasses.replace(loop_state, y=object(), solver_state=solver_state)
 
 
 def with_y(loop_state: Any, y: PyTree[Array]) -> Any:
@@ -314,33 +316,34 @@ class StepTimes(NamedTuple):
     controller: diffrax.AbstractStepSizeController
     init_state: Any
 
-    def number(self) -> Any:
-        """The number of steps."""
+    def num_steps(self) -> Any:
+        """The number of steps of the solve."""
         if isinstance(self.controller, diffrax.StepTo):
             return len(self.controller.ts) - 1
         # The state of a constant step size: steps so far, number of steps, and more.
-        _, number, *_ = self.init_state.controller_state
-        return number
+        _, num_steps, *_ = self.init_state.controller_state
+        return num_steps
 
     def time(self, i: Any) -> Any:
         """The time after `i` steps."""
         if isinstance(self.controller, diffrax.StepTo):
             return self.controller.ts[i]
-        _, *fixed = self.init_state.controller_state
-        first = self.init_state.tprev
-        second = self.init_state.tnext
-        # The controller computes times from the number of steps alone.
-        _, _, later, *_ = self.controller.adapt_step_size(
-            t0=first,
-            t1=second,
+        _, *other_state = self.init_state.controller_state
+        initial_time = self.init_state.tprev
+        time_after_first_step = self.init_state.tnext
+        # The controller computes times from the number of steps alone: the other arguments
+        # do not matter.
+        _, _, time_after_step, *_ = self.controller.adapt_step_size(
+            t0=initial_time,
+            t1=time_after_first_step,
             y0=None,
             y1_candidate=None,
             args=None,
             y_error=None,
             error_order=1,
-            controller_state=(i - 1, *fixed),
+            controller_state=(i - 1, *other_state),
         )
-        return jnp.where(i == 1, second, later)
+        return jnp.where(i == 1, time_after_first_step, time_after_step)
 
     def solver_state(self) -> Any:
         """The state of the solver before the first step."""

@@ -25,13 +25,13 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from ._compat import (
-    bound,
     ClosedJaxpr,
     has_blocking_lapack,
     is_program,
     Jaxpr,
     Literal,
     programs_in,
+    results_of_operation,
 )
 
 
@@ -63,15 +63,16 @@ def lapack_in_turn(fn: Callable) -> Callable:
             return fn(*args)
         traced, dynamic, static = eqx.filter_make_jaxpr(fn)(*args)
         arrays = jtu.tree_leaves(eqx.filter(args, eqx.is_array))
-        outs = _Turns().run(traced, arrays)
+        outs = _SequentialLapack().run(traced, arrays)
         treedef = jtu.tree_structure(dynamic)
         return eqx.combine(treedef.unflatten(outs), static)
 
     return call
 
 
-class _Turns:
-    """Evaluates a program in which each call of LAPACK waits for the one before."""
+class _SequentialLapack:
+    """Evaluates programs, one after another, so that each call of LAPACK waits for the one
+    before."""
 
     def __init__(self):
         # The results of the last call of LAPACK so far.
@@ -96,7 +97,7 @@ class _Turns:
         one before that did."""
         name = eqn.primitive.name
         if not _calls_lapack(eqn):
-            return bound(eqn, args, eqn.params)
+            return results_of_operation(eqn, args, eqn.params)
         if name in _CALLS:
             return self.run(eqn.params[_CALLS[name]], args)
         if name == "custom_linear_solve":
@@ -107,7 +108,7 @@ class _Turns:
         params = eqn.params
         if name in _CONTROL_FLOW:
             params = _with_turns_inside(params)
-        self._results_before = bound(eqn, args, params)
+        self._results_before = results_of_operation(eqn, args, params)
         return self._results_before
 
 
@@ -159,10 +160,14 @@ def _with_turns_inside(params: dict[str, Any]) -> dict[str, Any]:
     """The parameters of an operation. In all programs among them, each call of LAPACK waits
     for the one before."""
 
-    def in_turn(param: Any) -> Any:
+    def program_with_turns(param: Any) -> Any:
         if not isinstance(param, ClosedJaxpr):
             return param
         structs = [variable.aval for variable in param.jaxpr.invars]
-        return jax.make_jaxpr(lambda *args: _Turns().run(param, args))(*structs)
+        # The calls of the program wait for each other only: the operation as a whole waits
+        # for those before.
+        return jax.make_jaxpr(lambda *args: _SequentialLapack().run(param, args))(
+            *structs
+        )
 
-    return jtu.tree_map(in_turn, params, is_leaf=is_program)
+    return jtu.tree_map(program_with_turns, params, is_leaf=is_program)

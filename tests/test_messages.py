@@ -26,8 +26,16 @@ OTHERS = {
     "libllvm",
     "diffrax_symplectic",
 }
-# Of the user's functions, by the name of the argument that takes each of them.
-CHECKS = {"check_takes", "evaluated", "check_real", "real_array", "whole_number"}
+# Functions of the package that take the name of one of the user's arguments, as their first
+# argument or as `name`.
+CHECKS = {
+    "call_user_function",
+    "check_real",
+    "check_takes",
+    "checked_energy",
+    "checked_not_negative",
+    "whole_number",
+}
 # In backticks: an argument with its value, a function of the user's, and a name alone.
 WITH_VALUE = re.compile(r"(?<![\w.])([a-z]\w*)=(?!=)")
 OF_THE_USER = re.compile(r"(?<![\w.])([a-zH]\w*)\([\w, ]*\bargs\)")
@@ -83,6 +91,8 @@ def quoted_arguments(file: Path) -> set[str]:
     for call in ast.walk(tree):
         if isinstance(call, ast.Call) and getattr(call.func, "id", "") in CHECKS:
             found.add(text_of(call.args[0]))
+            found |= {text_of(x.value) for x in call.keywords if x.arg == "name"}
+    # The text of anything but a string is empty.
     return found - {""}
 
 
@@ -100,6 +110,12 @@ def test_messages_quote_only_arguments_and_functions_that_there_are():
         assert not unknown, (file.name, unknown)
 
 
+def test_the_checks_are_functions_of_the_package():
+    # Otherwise the messages of a function that was renamed would not be read.
+    nodes = [node for file in FILES for node in ast.walk(ast.parse(file.read_text()))]
+    assert CHECKS <= {node.name for node in nodes if isinstance(node, ast.FunctionDef)}
+
+
 def test_fields_of_results_are_no_arguments():
     assert "num_stragglers" not in known_names() and "num_paths" in known_names()
 
@@ -111,6 +127,7 @@ def test_fields_of_results_are_no_arguments():
         ("raise ValueError('`old` must be a number, and so must `H0.new`')", {"old"}),
         ("raise ValueError(f'pass `{name}={value}`, not `a == b`')", set()),
         ("check_takes('old', fn, 't', 'args')", {"old"}),
+        ("checked_energy(call_user_function('old', fn), name='new')", {"old", "new"}),
         ("def f():\n    '''Not `docstrings=3`.'''", set()),
     ],
 )

@@ -116,9 +116,9 @@ def test_diffrax_wraps_the_terms_of_a_solve_with_its_direction(terms):
     with jax.disable_jit(), jax.ensure_compile_time_eval():
         solve()
     assert _compat.direction(seen[1]) == -1 and _compat.direction(drift) == 1
-    other = _compat.replaced(seen[1], drift)
+    other = _compat.wrapped_like(seen[1], drift)
     assert _compat.direction(other) == -1 and _compat.unwrapped(other) is drift
-    assert _compat.replaced(drift, drift) is drift
+    assert _compat.wrapped_like(drift, drift) is drift
     turned = _compat.reversed_in_time({"drift": seen[1]})
     assert _compat.direction(turned) == 1
     assert type(turned["drift"]) is type(seen[1])
@@ -206,7 +206,7 @@ def test_adjoints_of_diffrax_run_a_loop_with_the_arguments_and_the_state_known_h
             adjoint=Spy(), max_steps=16,
         )  # fmt: skip
         # The state of a constant step size: how many steps are made, and in which times.
-        assert steps[0].number() == 11 == sol.stats["num_steps"]
+        assert steps[0].num_steps() == 11 == sol.stats["num_steps"]
         times = [steps[0].time(i) for i in range(12)]
     assert sol.ts[:12].tolist() == times and 0.2 in times and times[2] < 0.3
 
@@ -320,7 +320,7 @@ def test_solvers_of_lineax_compute_without_linear_solve():
         operator = lx.FunctionLinearOperator(
             lambda x: A @ x, jax.ShapeDtypeStruct((2,), A.dtype)
         )
-        x, result = _compat.computed_by(solver, operator, jnp.array([4.0, 4.0]))
+        x, result = _compat.linear_solution(solver, operator, jnp.array([4.0, 4.0]))
         assert result == lx.RESULTS.successful
         assert jnp.allclose(x, jnp.array([1.5, 1.0]), atol=1e-5)
 
@@ -409,7 +409,7 @@ def test_a_frozen_function_is_recorded_once():
     """If this fails: read about frozen functions in the documentation of Dr.Jit, and adapt
     `frozen`. Without it each call records and compiles its kernel anew."""
     number = array_types()["f64"]
-    double = _compat.frozen(lambda x: 2 * x, 10)
+    double = _compat.frozen_function(lambda x: 2 * x, 10)
     assert np.array_equal(double(number([1, 2, 3])), [2, 4, 6])
     assert np.array_equal(double(number([4, 5, 6, 7])), [8, 10, 12, 14])
     assert double.n_recordings == 1
@@ -461,7 +461,7 @@ def test_drjit_returns_the_constant_of_a_branch_from_a_conditional():
 
 def test_operations_of_a_jaxpr_are_evaluated_one_by_one():
     """If this fails: look up how `jax.core.eval_jaxpr` binds an operation, and adapt
-    `bound`."""
+    `results_of_operation`."""
 
     @jax.custom_jvp
     def sine(x):
@@ -470,9 +470,9 @@ def test_operations_of_a_jaxpr_are_evaluated_one_by_one():
     sine.defjvp(lambda primals, tangents: (sine(*primals), tangents[0]))
     program = jax.make_jaxpr(lambda x: jax.lax.sort((sine(x), x)))(jnp.arange(3.0))
     call, sort = program.jaxpr.eqns
-    (y,) = _compat.bound(call, [jnp.arange(3.0)], call.params)
+    (y,) = _compat.results_of_operation(call, [jnp.arange(3.0)], call.params)
     assert jnp.allclose(y, jnp.sin(jnp.arange(3.0)))
-    keys, values = _compat.bound(sort, [-y, y], sort.params)
+    keys, values = _compat.results_of_operation(sort, [-y, y], sort.params)
     assert jnp.array_equal(keys, jnp.sort(-y)) and jnp.array_equal(values, -keys)
 
 

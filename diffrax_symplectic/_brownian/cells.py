@@ -18,6 +18,11 @@ from .._custom_types import RealScalarLike
 from .stepwise import Increment, step_size, zeros_and_unravel
 
 
+# The ends of a step may be this fraction of a cell away from multiples of the cell. Rounded
+# times are nearer, and steps that are no multiples rarely so near.
+_CELL_TOLERANCE = 1e-3
+
+
 class Piece(eqx.Module):
     """A segment of a Brownian path of `m` noises.
 
@@ -33,7 +38,7 @@ class Piece(eqx.Module):
     A: Float[Array, "m m"] | None = None
 
     @staticmethod
-    def of(increment: Increment, h: Float[Array, ""]) -> "Piece":
+    def from_increment(increment: Increment, h: Float[Array, ""]) -> "Piece":
         """The segment of length `h` with this increment."""
         assert isinstance(increment, diffrax.AbstractBrownianIncrement)
         W, _ = jfu.ravel_pytree(increment.W)
@@ -50,7 +55,7 @@ class Piece(eqx.Module):
         assert self.integral is not None
         return self.integral / positive_or_one(self.h) - self.W / 2
 
-    def then(self, other: "Piece") -> "Piece":
+    def followed_by(self, other: "Piece") -> "Piece":
         """This segment followed by another, by Chen's rule."""
         integral = A = None
         if self.integral is not None and other.integral is not None:
@@ -108,25 +113,26 @@ def compose(
     sample: Callable[[Int[Array, ""]], Piece],
     path_name: str,
 ) -> Piece:
-    """The segment from `t0` to `t1`, where `sample(i)` is the cell that starts at
-    `i * cell`. It is an error when run if the segment does not consist of whole cells."""
+    """The segment from `t0` to `t1 >= t0`, composed of its cells: `sample(i)` is the one
+    that starts at `i * cell`. It is an error when run if the segment does not consist of
+    whole cells."""
     first_cell = jnp.round(t0 / cell).astype(int)
     end_cell = jnp.round(t1 / cell).astype(int)
-    off_at_start = jnp.abs(first_cell * cell - t0)
-    off_at_end = jnp.abs(end_cell * cell - t1)
-    off = jnp.maximum(off_at_start, off_at_end)
+    distance_at_start = jnp.abs(first_cell * cell - t0)
+    distance_at_end = jnp.abs(end_cell * cell - t1)
+    distance = jnp.maximum(distance_at_start, distance_at_end)
     # Times are sums of rounded steps, so they meet multiples of `cell` only nearly.
     end_cell = eqx.error_if(
         end_cell,
-        (off > 1e-3 * cell) | (end_cell < first_cell),
+        (distance > _CELL_TOLERANCE * cell) | (end_cell < first_cell),
         f"Steps of a `{path_name}` with `cell` must begin and end at multiples of `cell`. "
         "If they should, their times may have been rounded too much: enable 64 bits, or "
         "step with `diffrax.StepTo`.",
     )
     struct = jax.eval_shape(sample, first_cell)
-    empty = jtu.tree_map(lambda leaf: lax.full_like(leaf, 0), struct)
+    empty_piece = jtu.tree_map(lambda leaf: lax.full_like(leaf, 0), struct)
 
     def extend(i: Int[Array, ""], piece: Piece) -> Piece:
-        return piece.then(sample(i))
+        return piece.followed_by(sample(i))
 
-    return lax.fori_loop(first_cell, end_cell, extend, empty)
+    return lax.fori_loop(first_cell, end_cell, extend, empty_piece)

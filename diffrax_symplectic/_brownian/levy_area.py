@@ -1,5 +1,5 @@
 import dataclasses
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -33,7 +33,7 @@ class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):
     A: Float[Array, "m m"]
 
 
-# Matrix products over at most this many Fourier terms are unrolled.
+# Matrix products over at most this many Fourier terms are written out.
 _MOST_UNROLLED = 4
 
 
@@ -120,7 +120,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         if not use_levy:
             return 0
         m = num_noises(increment_struct(self.path))
-        return sum(_normals_by_use(m, self.num_terms))
+        return sum(_group_sizes(m, self.num_terms))
 
     def own_increment(self, increment, own_words, h, use_levy) -> Increment:
         """The increment with areas, sampled over the step as a whole, regardless of
@@ -152,7 +152,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         """The path over a step of size `h` with this increment, with areas from `words`."""
         assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
         H, _ = jfu.ravel_pytree(increment.H)
-        piece = Piece.of(increment, jnp.abs(h))
+        piece = Piece.from_increment(increment, jnp.abs(h))
         normals = normal_from_words(words, H.dtype)
         # The bridge over a step is one over unit time, scaled by the root of the step size.
         # Its areas are scaled by the step size.
@@ -163,11 +163,33 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         return dataclasses.replace(piece, A=outer - outer.T + bridge_area)
 
 
-def _normals_by_use(m: int, num_terms: int) -> tuple[int, ...]:
-    """The numbers of normal variables that the areas of `m` noises need: for the cosine and
-    sine coefficients, for the sum of all other cosine coefficients, and for the two parts
-    of the remainder's area."""
+class _Normals(NamedTuple):
+    """The independent standard normal numbers for the areas of a bridge.
+
+    - `cosines`, `sines`: for the Fourier coefficients, one noise after another.
+    - `remainder_sums`: for the sum of the remaining cosine coefficients of each noise.
+    - `mean_parts`: for the part of the remainder's area that comes from the means of these
+        coefficients, for each noise.
+    - `deviation_parts`: for the part that comes from their deviations, for each pair of
+        noises.
+    """
+
+    cosines: Float[Array, " m*terms"]
+    sines: Float[Array, " m*terms"]
+    remainder_sums: Float[Array, " m"]
+    mean_parts: Float[Array, " m"]
+    deviation_parts: Float[Array, " pairs"]
+
+
+def _group_sizes(m: int, num_terms: int) -> tuple[int, ...]:
+    """The numbers of normal variables in the fields of `_Normals`, for `m` noises."""
     return m * num_terms, m * num_terms, m, m, m * (m - 1) // 2
+
+
+def _in_groups(normals: Float[Array, " normals"], m: int, num_terms: int) -> _Normals:
+    """The normal numbers by their use, for `m` noises."""
+    ends = np.cumsum(_group_sizes(m, num_terms))
+    return _Normals(*jnp.split(normals, ends[:-1]))
 
 
 def _bridge_area(
@@ -181,30 +203,43 @@ def _bridge_area(
     area $\pi \sum_r r (a_{kr} b_{lr} - b_{kr} a_{lr})$.
     """
     m = H.size
+    # NumPy computes these constants, so that the program does not.
     orders = np.arange(1, num_terms + 1)
     variances = 1 / (2 * np.pi**2 * orders**2)
-    # Over all orders the variances add up to 1/12, and their squares to 1/360.
-    rest = 1 / 12 - np.sum(variances)
-    # With many terms, rounding could make it negative.
-    rest_squared = max(1 / 360 - np.sum(variances**2), 0)
-    # NumPy computes the constants above, so that the program does not.
+    # The sums of s_r and of s_r^2 over the terms of the remainder: over all orders they are
+    # 1/12 and 1/360. With many terms, rounding could make the second one negative.
+    remainder = 1 / 12 - np.sum(variances)
+    remainder_of_squares = max(1 / 360 - np.sum(variances**2), 0)
     deviations = jnp.asarray(np.sqrt(variances), H.dtype)
-    ends = np.cumsum(_normals_by_use(m, num_terms))
-    cosines, sines, for_rest, for_mean, for_area = jnp.split(normals, ends[:-1])
-    a = deviations * cosines.reshape(m, num_terms)
-    b = deviations * sines.reshape(m, num_terms)
-    total = jnp.sum(a, axis=1) + np.sqrt(rest) * for_rest
-    # The sum of all cosine coefficients, including the remainder, is -H. Given this, each
-    # one changes by its share of the variance, s_r / (1/12), in the difference.
-    a = a - jnp.asarray(12 * variances, H.dtype) * (total + H)[:, None]
+    groups = _in_groups(normals, m, num_terms)
+    a = deviations * groups.cosines.reshape(m, num_terms)
+    b = deviations * groups.sines.reshape(m, num_terms)
+    sum_of_all = jnp.sum(a, axis=1) + np.sqrt(remainder) * groups.remainder_sums
+    a = _with_integral(H, a, sum_of_all, variances)
     series = _weighted_product(a, b, np.pi * orders)
     # Cosine coefficients of the remainder have mean -12 s_r H, which gives the first part
     # of its area, and variance s_r - 12 s_r^2, which gives the second. Since (pi r)^2 s_r
     # is 1/2, the variances of these parts are sums of 144 s_r^2 / 2 and of s_r - 12 s_r^2.
-    mean_part = jnp.outer(H, np.sqrt(72 * rest_squared) * for_mean)
-    deviation = np.sqrt(rest - 12 * rest_squared)
-    area = series - mean_part + deviation * _strictly_upper(for_area, m)
-    return area - area.T
+    mean_part = jnp.outer(H, np.sqrt(72 * remainder_of_squares) * groups.mean_parts)
+    deviation = np.sqrt(remainder - 12 * remainder_of_squares)
+    # As in the formula, the second product of each area is the transpose of the first.
+    first_products = series - mean_part
+    first_products += deviation * _strictly_upper(groups.deviation_parts, m)
+    return first_products - first_products.T
+
+
+def _with_integral(
+    H: Float[Array, " m"],
+    a: Float[Array, "m terms"],
+    sum_of_all: Float[Array, " m"],
+    variances: np.ndarray,
+) -> Float[Array, "m terms"]:
+    """The cosine coefficients `a` of these variances in `_bridge_area`, changed so that the
+    integral is `H`. `sum_of_all` is their sum before, with all coefficients beyond."""
+    # The integral is `H` if the sum is -H. Of the difference, each coefficient takes a
+    # share in proportion to its variance, s_r / (1/12).
+    shares = jnp.asarray(12 * variances, H.dtype)
+    return a - shares * (sum_of_all + H)[:, None]
 
 
 def _weighted_product(
@@ -223,9 +258,10 @@ def _weighted_product(
 
 
 def _strictly_upper(x: Float[Array, " n"], m: int) -> Float[Array, "m m"]:
-    """The matrix with the entries `x` above its diagonal."""
-    number = np.zeros((m, m), int)
-    number[np.triu_indices(m, 1)] = np.arange(x.size)
+    """The matrix with the entries `x` above its diagonal, row by row, and zeros
+    elsewhere."""
+    indices = np.zeros((m, m), int)
+    indices[np.triu_indices(m, 1)] = np.arange(x.size)
     # A gather, since scattering is slow. For one noise there is no entry to gather from.
     padded = jnp.append(x, 0) if x.size == 0 else x
-    return jnp.triu(padded[number], 1)
+    return jnp.triu(padded[indices], 1)

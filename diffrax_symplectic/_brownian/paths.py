@@ -196,7 +196,9 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
             place = (i.astype(jnp.int32), jnp.array(0))
             # Areas are always drawn, so that increments do not depend on `use_levy`.
             words = self.words(place, use_levy=True)
-            return Piece.of(self.increment(words, 0 * h, h, use_levy=True), h)
+            # Given the words, only the size of a step matters, not where it begins.
+            increment = self.increment(words, 0 * h, h, use_levy=True)
+            return Piece.from_increment(increment, h)
 
         piece = compose(t0, t1, self.cell, sample, type(self).__name__)
         return piece.as_increment(self.levy_area, self.shape, t1 - t0, use_levy)

@@ -30,40 +30,59 @@ AREA_WORDS = 2 * _MOST_PAIRS
 
 
 def random_words(
-    key: PRNGKeyArray, place: Place, num_sets: int, set_size: int, begin: int = 0
+    key: PRNGKeyArray, place: Place, num_sets: int, set_size: int, first_pair: int = 0
 ) -> UInt32[Array, "num_sets set_size"]:
     """Random words for a step at `place`, in `num_sets` sets of `set_size` words each. More
-    sets leave the first ones unchanged. Words for different values of `begin` are
-    independent, so a path and a wrapper around it may share a key. Raises a `ValueError`
-    for an array of keys."""
+    sets leave the first ones unchanged. Raises a `ValueError` for an array of keys.
+
+    `first_pair` is 0 for a path, and `PLATEAU_WORDS` or `AREA_WORDS` for a wrapper around
+    it: their words are independent, so that they may share a key.
+    """
     key = typed_key(key)
     if key.ndim > 0:
         raise ValueError(
             "A Brownian path needs one random key; got an array of keys of shape "
             f"{key.shape}. Use `jax.vmap` over it."
         )
-    count, exponent = place
     num_words = num_sets * set_size
+    if is_threefry(key) and 0 < num_words <= 2 * _MOST_PAIRS:
+        words = _words_from_counters(key, place, num_words, first_pair)
+        return words.reshape(num_sets, set_size)
+    return _words_from_keys_of_sets(key, place, num_sets, set_size, first_pair)
+
+
+def _words_from_counters(
+    key: PRNGKeyArray, place: Place, num_words: int, first_pair: int
+) -> UInt32[Array, " num_words"]:
+    """Words of Threefry, of which each hash of a counter yields a pair. The counter is the
+    place and the number of the pair: folding and splitting keys would take three hashes for
+    the first word."""
+    count, exponent = place
     num_pairs = (num_words + 1) // 2
-    if is_threefry(key) and 0 < num_pairs <= _MOST_PAIRS:
-        # With the place as counter, one hash yields two words. Folding and splitting keys
-        # would take three hashes for the first word. The exponent fills the upper 12 of 32
-        # bits, the number of the pair the 20 bits below.
-        pair_numbers = np.arange(begin, begin + num_pairs, dtype=np.uint32)
-        upper = count.astype(jnp.uint32)
-        lower = (exponent.astype(jnp.uint32) << 20) + pair_numbers
+    pair_numbers = np.arange(first_pair, first_pair + num_pairs, dtype=np.uint32)
+    # A counter consists of two words. In the second one the exponent fills the upper 12
+    # bits, and the number of the pair the 20 bits below.
+    count_word = count.astype(jnp.uint32)
+    pair_word = (exponent.astype(jnp.uint32) << 20) + pair_numbers
 
-        def hash_counters() -> tuple[Array, ...]:
-            pair = _threefry(jr.key_data(key), upper, lower)
-            # A single word needs only the first of its pair.
-            return pair[:num_words]
+    def hash_counters() -> tuple[Array, ...]:
+        pair = _threefry(jr.key_data(key), count_word, pair_word)
+        # A single word needs only the first of its pair.
+        return pair[:num_words]
 
-        # XLA would compute each of the two words in a separate kernel.
-        words = jnp.stack(materialize(hash_counters), axis=1)
-        return words.reshape(-1)[:num_words].reshape(num_sets, set_size)
+    # XLA would compute each of the two words in a separate kernel.
+    words = jnp.stack(materialize(hash_counters), axis=1)
+    return words.reshape(-1)[:num_words]
+
+
+def _words_from_keys_of_sets(
+    key: PRNGKeyArray, place: Place, num_sets: int, set_size: int, first_pair: int
+) -> UInt32[Array, "num_sets set_size"]:
+    """Words of any generator of JAX. Each set has a key of its own, so that more sets leave
+    the first ones unchanged."""
+    count, exponent = place
     step_key = jr.fold_in(jr.fold_in(key, count), exponent)
-    # Each set has a key of its own, so that more sets leave the first ones unchanged.
-    set_keys = [jr.fold_in(step_key, begin + i) for i in range(num_sets)]
+    set_keys = [jr.fold_in(step_key, first_pair + i) for i in range(num_sets)]
     return jnp.stack(
         [jr.bits(set_key, (set_size,), jnp.uint32) for set_key in set_keys]
     )
@@ -75,15 +94,15 @@ _PARITY = np.uint32(0x1BD11BDA)
 
 
 def _threefry(
-    key: UInt32[Array, "2"], upper: Array, lower: Array
+    key: UInt32[Array, "2"], count_word: Array, pair_word: Array
 ) -> tuple[Array, Array]:
     """Threefry-2x32 with 20 rounds, by Salmon et al. (SC'11, doi:10.1145/2063384.2063405):
-    the words of JAX's generator for this key and counters `(upper, lower)`. Unrolled, since
-    JAX's version is a loop of eighty kernels on CPUs: three words for each of 512 paths
-    take 3 ns per path instead of 16."""
+    the words of JAX's generator for this key and counters `(count_word, pair_word)`.
+    Unrolled, since JAX's version is a loop of eighty kernels on CPUs: three words for each
+    of 512 paths take 3 ns per path instead of 16."""
     keys = [key[0], key[1], key[0] ^ key[1] ^ _PARITY]
-    first = upper + keys[0]
-    second = lower + keys[1]
+    first = count_word + keys[0]
+    second = pair_word + keys[1]
     # Five groups of four rounds, after each of which two of the keys are added, in turns.
     for group in range(5):
         for bits in _ROTATIONS[group % 2]:
@@ -117,39 +136,43 @@ def typed_key(key: PRNGKeyArray | UInt32[Array, "..."]) -> PRNGKeyArray:
     return jr.wrap_key_data(key) if key.dtype == jnp.uint32 else key
 
 
-def derived_key(key: PRNGKeyArray, old: Array) -> Array:
-    """A key derived from `key` to take the place of `old`, of the same kind and shape.
+def derived_key(key: PRNGKeyArray, old_key: Array) -> Array:
+    """A key derived from `key` to take the place of `old_key`, of the same kind and shape.
     Equal old keys get the same new one."""
-    old_words = jr.key_data(typed_key(old))
+    old_words = jr.key_data(typed_key(old_key))
     for word in old_words.reshape(-1):
         key = jr.fold_in(key, word)
     new_words = jr.bits(key, old_words.shape, jnp.uint32)
-    if old.dtype == jnp.uint32:
+    if old_key.dtype == jnp.uint32:
         # A key from `jax.random.PRNGKey` consists of its words.
         return new_words
-    return jr.wrap_key_data(new_words, impl=jr.key_impl(old))
+    return jr.wrap_key_data(new_words, impl=jr.key_impl(old_key))
 
 
-# `place_of` rounds sizes of steps to powers of two and their middles to integers. These odd
-# constants keep steps of round numbers away from where it rounds.
-_OFF_POWERS = 1.37
-_OFF_INTEGERS = 0.29
+# `place_of` rounds the sizes of steps, times this factor, to powers of two, and their
+# middles, plus this shift, to integers. Neither is a round number: for steps of round
+# numbers, no rounding error can then change the result.
+_SIZE_FACTOR = 1.37
+_COUNT_SHIFT = 0.29
 
 
 def place_of(t0: Array, t1: Array) -> Place:
-    """The position of a step as two integers, which do not change if times are rounded.
+    r"""The position of a step as two integers, which do not change if times are rounded:
 
-    The first counts the middle of the step in units of a power of two that is between a
-    third and 0.7 of the step (1.37 times a quarter and a half); the second is the exponent.
-    So two steps have the same integers only if they overlap.
+    $$ n = \Bigl\lfloor \frac{t_0 + t_1}{2 \cdot 2^e} + 0.29 \Bigr\rfloor, \qquad
+    e = \lfloor \log_2(1.37\, |t_1 - t_0|) \rfloor - 1. $$
+
+    So the middle of the step is counted in units of $2^e$, which is between a third and 0.7
+    of the step (1.37 times a quarter and a half). Two steps with the same integers have
+    middles less than one unit apart, and are longer than that, so they overlap.
     """
-    units_per_time, exponent = _inverse_power_of_two(jnp.abs(t1 - t0) * _OFF_POWERS)
+    units_per_time, exponent = _inverse_power_of_two(jnp.abs(t1 - t0) * _SIZE_FACTOR)
     # Late in a long float32 solve, two steps may round to the same middle. So the integer
     # part of the start, which is exact, is split off before adding half a step.
     start = t0 * units_per_time
     half = (t1 - t0) / 2 * units_per_time
     whole = jnp.floor(start)
-    rest = jnp.floor(start - whole + half + _OFF_INTEGERS)
+    rest = jnp.floor(start - whole + half + _COUNT_SHIFT)
     # The count wraps around after 2^31 units, or fewer in half precision.
     period = 2.0 ** min(31, jnp.finfo(whole.dtype).maxexp - 1)
     whole = whole - period * jnp.trunc(whole / period)
@@ -157,16 +180,18 @@ def place_of(t0: Array, t1: Array) -> Place:
 
 
 def _inverse_power_of_two(x: Array) -> tuple[Array, Integer[Array, ""]]:
-    """One over a power of two that is between a quarter and half of `x > 0`, and the
-    exponent of that power. They come from the bits of `x`: `jnp.frexp` and `jnp.ldexp`
-    would take as long as a random word."""
+    """`2^-e` and the exponent `e`, where `2^e` is the power of two that is more than a
+    quarter and at most half of `x > 0`. They come from the bits of `x`: `jnp.frexp` and
+    `jnp.ldexp` would take as long as a random word."""
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(x, f"int{info.bits}")
-    # The number is positive, so above its mantissa is only the exponent.
+    # The number is positive, so above its mantissa is only the exponent, which is stored
+    # with an offset, the bias: `x` lies between `2^(biased - bias)` and twice that.
     biased = bits >> info.nmant
     bias = 2 ** (info.nexp - 1) - 1
-    # An exponent with an empty mantissa is a power of two, here one over the largest power
-    # of two up to `x`. Twice this belongs to half of that power.
+    # With a mantissa of zeros, an exponent stands for a power of two: this one for
+    # `2^(bias - biased)`, which is one over the largest power of two up to `x`. Times two,
+    # it is one over half of that power, which is `2^-e`.
     inverse = lax.bitcast_convert_type((2 * bias - biased) << info.nmant, x.dtype) * 2
     exponent = biased.astype(jnp.int32) - (bias + 1)
     # For an empty step, in which a path has no noise, any unit will do.
@@ -268,26 +293,32 @@ def _polynomial(coefficients: tuple[float, ...], x: Array) -> Array:
 
 
 _ROOT3 = math.sqrt(3)
-_SIXTH = 2**32 // 6
-# The four-point law is the Gauss-Hermite rule with four nodes.
-_SMALL = float(np.sqrt(3 - np.sqrt(6)))
-_LARGE = float(np.sqrt(3 + np.sqrt(6)))
-_LIKELY = float((3 + np.sqrt(6)) / 12)
-_UNLIKELY = float((3 - np.sqrt(6)) / 12)
-_RARE = round(2**32 * _UNLIKELY)
+_SIXTH_OF_WORDS = 2**32 // 6
+# The four-point law is the Gauss-Hermite rule with four nodes: two values and their
+# negatives, of which the larger one is less probable.
+_SMALL_VALUE = float(np.sqrt(3 - np.sqrt(6)))
+_LARGE_VALUE = float(np.sqrt(3 + np.sqrt(6)))
+_PROBABILITY_OF_SMALL = float((3 + np.sqrt(6)) / 12)
+_PROBABILITY_OF_LARGE = float((3 - np.sqrt(6)) / 12)
+_WORDS_OF_LARGE = round(2**32 * _PROBABILITY_OF_LARGE)
 
 # This law matches moments 1 to 5 of the normal distribution. Odd moments vanish exactly,
 # since as many words give one sign as the other.
 THREE_POINT = Discrete(
     values=(-_ROOT3, 0.0, _ROOT3),
     probabilities=(1 / 6, 2 / 3, 1 / 6),
-    cuts=(_SIXTH, 2**32 - _SIXTH),
+    cuts=(_SIXTH_OF_WORDS, 2**32 - _SIXTH_OF_WORDS),
 )
 # This law matches moments 1 to 7. Words below 2^31 give negative values.
 FOUR_POINT = Discrete(
-    values=(-_LARGE, -_SMALL, _LARGE, _SMALL),
-    probabilities=(_UNLIKELY, _LIKELY, _UNLIKELY, _LIKELY),
-    cuts=(_RARE, 2**31, 2**31 + _RARE),
+    values=(-_LARGE_VALUE, -_SMALL_VALUE, _LARGE_VALUE, _SMALL_VALUE),
+    probabilities=(
+        _PROBABILITY_OF_LARGE,
+        _PROBABILITY_OF_SMALL,
+        _PROBABILITY_OF_LARGE,
+        _PROBABILITY_OF_SMALL,
+    ),
+    cuts=(_WORDS_OF_LARGE, 2**31, 2**31 + _WORDS_OF_LARGE),
 )
 
 # A fair sign.

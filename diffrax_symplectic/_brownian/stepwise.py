@@ -123,8 +123,8 @@ class AbstractPathWithLaws(AbstractStepwisePath):
             return variables_from_words(law, words[:set_size], h, self.shape)
         variables = {}
         for i, (name, law) in enumerate(self.laws.items()):
-            own_words = words[i * set_size : (i + 1) * set_size]
-            variables[name] = variables_from_words(law, own_words, h, self.shape)
+            set_of_words = words[i * set_size : (i + 1) * set_size]
+            variables[name] = variables_from_words(law, set_of_words, h, self.shape)
         # To a type checker `levy_area` is any class of increments.
         return cast(Any, self.levy_area)(dt=step_size(h, self.shape), **variables)
 

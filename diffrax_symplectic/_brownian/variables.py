@@ -16,22 +16,33 @@ from .wrappers import PlateauBrownianPath, PlateauIncrement, TruncatedBrownianPa
 # Makes a Brownian path of a shape from a key.
 _MakePath: TypeAlias = Callable[[Any, PRNGKeyArray], diffrax.AbstractBrownianPath]
 
-_with_space_time_area = ft.partial(
+_path_with_space_time_area = ft.partial(
     FixedStepBrownianPath, levy_area=diffrax.SpaceTimeLevyArea
 )
 
 
-def _truncated(shape: Any, key: PRNGKeyArray) -> TruncatedBrownianPath:
+def _truncated_path(shape: Any, key: PRNGKeyArray) -> TruncatedBrownianPath:
     return TruncatedBrownianPath(FixedStepBrownianPath(shape, key))
 
 
-# A wrapper may share the key of its path: it draws other random words from it.
-def _with_levy_areas(shape: Any, key: PRNGKeyArray) -> LevyAreaBrownianPath:
-    return LevyAreaBrownianPath(_with_space_time_area(shape, key), key)
+# A wrapper may share the key of its path: it draws other random words from the key.
+def _path_with_levy_areas(shape: Any, key: PRNGKeyArray) -> LevyAreaBrownianPath:
+    return LevyAreaBrownianPath(_path_with_space_time_area(shape, key), key)
 
 
-def _with_plateaus(shape: Any, key: PRNGKeyArray) -> PlateauBrownianPath:
-    return PlateauBrownianPath(_with_space_time_area(shape, key), key)
+def _path_with_plateaus(shape: Any, key: PRNGKeyArray) -> PlateauBrownianPath:
+    return PlateauBrownianPath(_path_with_space_time_area(shape, key), key)
+
+
+class SourceAttributes(NamedTuple):
+    """The attributes of an increment from which a random variable is computed.
+
+    - `required`: those that it cannot do without.
+    - `optional`: those that are used if the increment has them.
+    """
+
+    required: tuple[str, ...]
+    optional: tuple[str, ...]
 
 
 class RandomVariable(NamedTuple):
@@ -48,8 +59,8 @@ class RandomVariable(NamedTuple):
         random variables.
     - `drives`: the vector fields that it multiplies: the noise, the brackets between
         noises, or their brackets with the drift.
-    - `held`: if it is not an attribute of the increment itself, the attributes from which
-        it is computed, and optional attributes that are used if present.
+    - `held`: if it is not an attribute of the increment itself, the attributes in which
+        the increment holds it.
     """
 
     increment: type[diffrax.AbstractBrownianIncrement]
@@ -59,7 +70,7 @@ class RandomVariable(NamedTuple):
     variance: float | None = 1.0
     even: bool = False
     drives: Literal["noise", "noise brackets", "drift brackets"] = "noise"
-    held: tuple[tuple[str, ...], tuple[str, ...]] | None = None
+    held: SourceAttributes | None = None
 
     @property
     def advice(self) -> str:
@@ -72,14 +83,14 @@ _area = ft.partial(
     RandomVariable,
     increment=diffrax.AbstractSpaceTimeLevyArea,
     name="space-time Lévy area",
-    path=_with_space_time_area,
+    path=_path_with_space_time_area,
     rank=4,
 )
 _plateau = ft.partial(
     RandomVariable,
     increment=PlateauIncrement,
     name="plateaus",
-    path=_with_plateaus,
+    path=_path_with_plateaus,
     rank=5,
 )
 
@@ -88,7 +99,7 @@ VARIABLES = {
     "A": RandomVariable(
         increment=LevyAreaIncrement,
         name="Lévy areas",
-        path=_with_levy_areas,
+        path=_path_with_levy_areas,
         rank=6,
         # Their law is known only given the increments.
         variance=None,
@@ -102,7 +113,7 @@ VARIABLES = {
         variance=None,
         even=True,
         drives="drift brackets",
-        held=(("W", "H"), ("K",)),
+        held=SourceAttributes(required=("W", "H"), optional=("K",)),
     ),
     # The time-reversed bridge has the same integral.
     "H": _area(variance=1 / 12, even=True),
@@ -142,8 +153,8 @@ def drives(name: str) -> str:
 def most_demanding_variable(names: Collection[str]) -> RandomVariable | None:
     """The random variable of the highest rank among these, or `None` if all are unknown."""
     # A solver of the user's own may have variables that are not known here.
-    known = [VARIABLES[name] for name in names if name in VARIABLES]
-    return max(known, key=lambda variable: variable.rank, default=None)
+    variables = [VARIABLES[name] for name in names if name in VARIABLES]
+    return max(variables, key=lambda variable: variable.rank, default=None)
 
 
 def path_maker(
@@ -152,9 +163,9 @@ def path_maker(
     """A function of a shape and a key that makes a path with these random variables. If
     only increments are needed, they may be `gaussian`, and then also `bounded`, for
     implicit methods."""
-    # In the table, the path of `"W"` is the discrete one.
-    decisive = set(variables) - {"W"} if gaussian else variables
-    variable = most_demanding_variable(decisive)
+    # In the table, the path of `"W"` is the discrete one, not for Gaussian increments.
+    names = set(variables) - {"W"} if gaussian else variables
+    variable = most_demanding_variable(names)
     if variable is not None:
         return variable.path
-    return _truncated if bounded else FixedStepBrownianPath
+    return _truncated_path if bounded else FixedStepBrownianPath

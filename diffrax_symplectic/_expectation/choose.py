@@ -18,7 +18,7 @@ from .fused_paths import fused_plan
 from .independent import IndependentPaths
 from .kinks import has_kinks
 from .sampling import AbstractSampling, SamplingPlan, SAVED_SAMPLINGS
-from .sorted import ArrayRQMC, step_words
+from .sorted import ArrayRQMC, word_layout
 
 
 # Folded into the key of a call to draw trials. Numbers of samples, from which the keys of
@@ -258,6 +258,6 @@ def _can_be_sorted(problem: Problem) -> bool:
     if _num_components(problem) > _MOST_COMPONENTS_SORTED:
         return False
     try:
-        return 0 < step_words(problem.terms).num_words <= _MOST_WORDS
+        return 0 < word_layout(problem.terms).num_words <= _MOST_WORDS
     except ValueError:
         return False

@@ -8,8 +8,10 @@ by other means.
 
     functions, arrays = functions_and_arrays(system, key, None, False)
     kernels = Kernels(functions)
-    lanes, shared = kernels.begin(arrays, key, h, 0, 1000, y0, None)  # paths 0 to 999
-    lanes = kernels.advance(lanes, shared, 0, 100)  # steps 0 to 99
+    # Paths 0 to 999.
+    lanes, shared = kernels.lanes_and_shared(arrays, key, h, 0, 1000, y0, None)
+    # Steps 0 to 99.
+    lanes = kernels.advance(lanes, shared, 0, 100)
 
 Kernels depend on `functions` alone, so that the same serve for all values of `arrays`, step
 sizes, and numbers of steps and paths.

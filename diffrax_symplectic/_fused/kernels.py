@@ -11,16 +11,16 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
-from .._compat import frozen, variable_number
+from .._compat import frozen_function, variable_number
 from .._custom_types import RealScalarLike
 from .._stablehlo import (
     array_in_memory,
     array_types,
     ArrayType,
-    chosen,
     drjit,
+    elements_of_both,
+    elements_where,
     entries_of,
-    merged,
     scalar,
     tensors_from,
 )
@@ -41,13 +41,13 @@ _MOST_RECORDINGS = 100
 class Lanes(NamedTuple):
     """The paths of a batch. Each Dr.Jit array has one lane for each path.
 
-    - `own`: the words of the random keys, and the entries of the paths' own `args`.
+    - `own_arrays`: the words of the random keys, and the entries of the paths' own `args`.
     - `y`: the entries of the states.
     - `solver_state`: the entries of the solver states that steps change.
     - `stopped`: whether a step of the path was not solved.
     """
 
-    own: list[Any]
+    own_arrays: list[Any]
     y: list[Any]
     solver_state: list[Any]
     stopped: Any
@@ -76,7 +76,7 @@ class Kernels:
         arrays = functions.arrays
         key = functions.key
         keys = jax.eval_shape(functions.path_keys, arrays, key, word, word)
-        own = [*keys, *functions.own_args]
+        own_arrays = [*keys, *functions.own_args]
         y = jax.eval_shape(functions.y0, arrays)
         _check_size(sum(x.size for x in y))
         self._path_keys = Program(
@@ -87,18 +87,18 @@ class Kernels:
             functions.step,
             dict(
                 arrays=arrays,
-                own=own,
+                own_arrays=own_arrays,
                 h=jax.ShapeDtypeStruct((), jnp.result_type(*y)),
                 i=jax.ShapeDtypeStruct((), "int32"),
                 y=y,
-                solver_state=jax.eval_shape(functions.start, arrays, own, y),
+                solver_state=jax.eval_shape(functions.start, arrays, own_arrays, y),
             ),
         )
         self._is_moving = self._moving_arrays()
         self._constants = self._step.replay.constants()
         self._compiled_solver_state = jax.jit(self._solver_state_at_start)
-        self._make_keys = frozen(self._record_keys, _MOST_RECORDINGS)
-        self._take_steps = frozen(self._record_steps, _MOST_RECORDINGS)
+        self._make_keys = frozen_function(self._record_keys, _MOST_RECORDINGS)
+        self._take_steps = frozen_function(self._record_steps, _MOST_RECORDINGS)
 
     def _moving_arrays(self) -> list[bool]:
         """For each array of the solver state, whether each path has its own. If all paths
@@ -139,7 +139,7 @@ class Kernels:
             return jax.vmap(start_of_path)(y, own_args)
         return start_of_path(y, own_args)
 
-    def begin(
+    def lanes_and_shared(
         self,
         arrays: list[Array],
         key: PRNGKeyArray,
@@ -149,9 +149,9 @@ class Kernels:
         y0: PyTree[Array],
         own_args: PyTree[Array],
     ) -> tuple[Lanes, Shared]:
-        """The paths with the numbers `first_path` to `first_path + num_paths - 1`, and what
-        they share in steps of size `h`. If paths differ, `y0` and `own_args` have a leading
-        axis of paths."""
+        """The paths with the numbers `first_path` to `first_path + num_paths - 1` before
+        their first step, and what they share in steps of size `h`. If paths differ, `y0`
+        and `own_args` have a leading axis of paths."""
         dr = drjit()
         kinds = array_types()
         # The number of the first path is opaque: otherwise it would be a constant of the
@@ -160,17 +160,16 @@ class Kernels:
         path_numbers = dr.arange(kinds["ui64"], num_paths) + offset
         high = kinds["ui32"](path_numbers >> 32)
         low = kinds["ui32"](path_numbers)
-        dr.eval(high, low)
         packed_for_keys = pack(self._types_for_keys, [*arrays, key])
         keys = self._make_keys(packed_for_keys, high, low)
         y_leaves = jtu.tree_leaves(y0)
         args_leaves = jtu.tree_leaves(own_args)
         solver_state = self._compiled_solver_state(arrays, key, y_leaves, args_leaves)
-        moving = chosen(solver_state, self._is_moving)
-        fixed = chosen(solver_state, self._is_fixed)
+        moving = elements_where(solver_state, self._is_moving)
+        fixed = elements_where(solver_state, self._is_fixed)
         args_entries = self._in_lanes(self._types_of_own_args, args_leaves, num_paths)
         lanes = Lanes(
-            own=[*keys, *args_entries],
+            own_arrays=[*keys, *args_entries],
             y=self._in_lanes(self._step.types["y"], y_leaves, num_paths),
             solver_state=self._in_lanes(self._types_of_moving, moving, num_paths),
             stopped=dr.opaque(kinds["i1"], False, num_paths),
@@ -178,14 +177,16 @@ class Kernels:
         packed = pack(self._types_of_shared, [*arrays, np.asarray(h), *fixed])
         return lanes, Shared(packed, self._constants)
 
-    def advance(self, lanes: Lanes, shared: Shared, begin: int, end: int) -> Lanes:
-        """The paths after the steps `begin` to `end - 1`."""
+    def advance(
+        self, lanes: Lanes, shared: Shared, first_step: int, end_step: int
+    ) -> Lanes:
+        """The paths after the steps `first_step` to `end_step - 1`."""
         # Numbers of steps are opaque, so that other numbers need no other kernel.
         opaque = ft.partial(drjit().opaque, array_types()["i32"])
         y, solver_state, stopped = self._take_steps(
-            *shared, opaque(begin), opaque(end), *lanes
+            *shared, opaque(first_step), opaque(end_step), *lanes
         )
-        return Lanes(lanes.own, y, solver_state, stopped)
+        return Lanes(lanes.own_arrays, y, solver_state, stopped)
 
     def _in_lanes(
         self, types: list[ArrayType], arrays: list[Array], num_paths: int
@@ -213,20 +214,21 @@ class Kernels:
 
     @property
     def _types_of_own_args(self) -> list[ArrayType]:
-        # In what each path has of its own, the keys come first, and then `args`.
-        own = self._step.types["own"]
-        num_keys = len(own) - len(self._functions.own_args)
-        return own[num_keys:]
+        # Of the arrays that each path has of its own, the keys come first, and then those
+        # of `args`.
+        types = self._step.types["own_arrays"]
+        num_keys = len(types) - len(self._functions.own_args)
+        return types[num_keys:]
 
     @property
     def _types_of_shared(self) -> list[ArrayType]:
         types = self._step.types
-        fixed = chosen(types["solver_state"], self._is_fixed)
+        fixed = elements_where(types["solver_state"], self._is_fixed)
         return [*types["arrays"], *types["h"], *fixed]
 
     @property
     def _types_of_moving(self) -> list[ArrayType]:
-        return chosen(self._step.types["solver_state"], self._is_moving)
+        return elements_where(self._step.types["solver_state"], self._is_moving)
 
     @property
     def _is_fixed(self) -> list[bool]:
@@ -243,39 +245,39 @@ class Kernels:
         self,
         packed: dict[str, Any],
         constants: list[Any],
-        begin: Any,
-        end: Any,
-        own: list[Any],
+        first_step: Any,
+        end_step: Any,
+        own_arrays: list[Any],
         y: list[Any],
         solver_state: list[Any],
         stopped: Any,
     ) -> tuple[list[Any], list[Any], Any]:
-        """The state, the solver state and which paths stopped after the steps `begin` to
-        `end - 1`, from those before, as Dr.Jit records the loop over steps."""
+        """The state, the solver state and which paths stopped after the steps `first_step`
+        to `end_step - 1`, from those before, as Dr.Jit records the loop over steps."""
         select = drjit().select
         # Dr.Jit numbers its variables one after another, one for each operation. So the
         # number of this variable and of the last one below count the operations between.
-        first_variable = variable_number(begin + 1)
+        first_variable = variable_number(first_step + 1)
         step = self._step
-        # In the order in which `begin` packs them: the arrays of the system, the step size,
-        # and the arrays of the solver state that steps do not change.
+        # In the order in which `lanes_and_shared` packs them: the arrays of the system, the
+        # step size, and the arrays of the solver state that steps do not change.
         num_arrays = len(step.types["arrays"])
         shared = unpack(self._types_of_shared, packed)
         arrays = shared[:num_arrays]
         h, *fixed = shared[num_arrays:]
-        own_tensors = tensors_from(own, shapes_of(step.types["own"]))
+        own_tensors = tensors_from(own_arrays, shapes_of(step.types["own_arrays"]))
         shapes_of_y = shapes_of(step.types["y"])
         shapes_of_moving = shapes_of(self._types_of_moving)
 
         def has_more_steps(i: Any, *_state: Any) -> Any:
-            return i < end
+            return i < end_step
 
         # The entries are those of `y`, followed by those of the moving solver state.
         def after_step(i: Any, stopped: Any, *entries: Any) -> tuple[Any, ...]:
             remaining_entries = iter(entries)
             y_tensors = tensors_from(remaining_entries, shapes_of_y)
             moving = tensors_from(remaining_entries, shapes_of_moving)
-            whole_solver_state = merged(self._is_moving, moving, fixed)
+            whole_solver_state = elements_of_both(self._is_moving, moving, fixed)
             results, error_masks = step.replay(
                 *arrays,
                 *own_tensors,
@@ -292,16 +294,16 @@ class Kernels:
                 stopped = stopped | failed
             new_y = states[: len(y_tensors)]
             new_solver_state = states[len(y_tensors) :]
-            new_moving = chosen(new_solver_state, self._is_moving)
+            new_moving = elements_where(new_solver_state, self._is_moving)
             new_entries = [*entries_of(new_y), *entries_of(new_moving)]
             # A path that stopped stays where it was: its numbers could be NaN, with which
             # sweeps end last.
             kept = [select(stopped, old, new) for old, new in zip(entries, new_entries)]
             return i + 1, stopped, *kept
 
-        state_at_begin = (begin, stopped, *y, *solver_state)
+        state_at_start = (first_step, stopped, *y, *solver_state)
         _, stopped, *entries = drjit().while_loop(
-            state_at_begin, has_more_steps, after_step, mode="symbolic"
+            state_at_start, has_more_steps, after_step, mode="symbolic"
         )
         last_variable = max(map(variable_number, [stopped, *entries]))
         _warn_of_operations(last_variable - first_variable)

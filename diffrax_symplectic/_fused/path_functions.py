@@ -28,7 +28,7 @@ class SteppedSystem(Protocol):
     y0: Y
     args: Args
 
-    def with_args(self, own: PyTree[Array]) -> "SteppedSystem":
+    def with_args(self, own_args: PyTree[Array]) -> "SteppedSystem":
         """The system with these arrays in its `args`."""
         ...
 
@@ -61,9 +61,9 @@ class PathFunctions(NamedTuple):
     """A system without the values of its arrays, as functions of these values. Hashable: it
     is what a kernel is compiled for.
 
-    In these functions `arrays` are the arrays of the system, and `own` is what each path
-    has of its own: the words of its random keys, followed by the arrays of its `args` if
-    these are drawn.
+    In these functions `arrays` are the arrays of the system, and `own_arrays` those that
+    each path has of its own: the words of its random keys, followed by the arrays of its
+    `args` if these are drawn.
 
     - `treedef`, `static`, `structs`: the system. Where it has an array, `static` is `None`
         and `structs` has its shape and type.
@@ -112,21 +112,23 @@ class PathFunctions(NamedTuple):
         """The random keys in the terms of path number `high * 2^32 + low`."""
         return path_keys(self.system(arrays).terms, sample_key(key, high, low))
 
-    def start(self, arrays: list[Array], own: list[Array], y: list[Array]) -> list:
+    def start(
+        self, arrays: list[Array], own_arrays: list[Array], y: list[Array]
+    ) -> list:
         """The leaves of the state of the solver before the first step of a path from
         `y`."""
-        system, terms = self._system_and_terms(arrays, own)
+        system, terms = self._system_and_terms(arrays, own_arrays)
         y = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
         # No solver's initial state depends on the size of a step.
         h = jnp.ones((), jnp.result_type(*jtu.tree_leaves(y)))
         return jtu.tree_leaves(system.init(terms, 0, h, y))
 
     def step(
-        self, arrays, own, h, i, y: list[Array], solver_state: list[Array]
+        self, arrays, own_arrays, h, i, y: list[Array], solver_state: list[Array]
     ) -> Stepped:
         """A path after step number `i` of size `h`, from the leaves of its state `y` and of
         the solver's state."""
-        system, terms = self._system_and_terms(arrays, own)
+        system, terms = self._system_and_terms(arrays, own_arrays)
         # `init` is traced and not run: only the structure of the solver's state is needed.
         solver_struct = eqx.filter_eval_shape(system.init, terms, 0, h, system.y0)
         y = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
@@ -137,19 +139,18 @@ class PathFunctions(NamedTuple):
         return Stepped(jtu.tree_leaves(y), jtu.tree_leaves(solver_state), success)
 
     def _system_and_terms(
-        self, arrays: list[Array], own: list[Array]
+        self, arrays: list[Array], own_arrays: list[Array]
     ) -> tuple[SteppedSystem, PyTree]:
         """The system with the `args` of a path, and its terms with the keys of the path.
         (The terms within the system keep the keys of the system.)"""
         system = self.system(arrays)
-        # In `own` the keys come first, and then the arrays of `args`, as `Kernels` joins
-        # them.
-        num_keys = len(own) - len(self.own_args)
-        keys = own[:num_keys]
+        # The keys come first, and then the arrays of `args`, as `Kernels` joins them.
+        num_keys = len(own_arrays) - len(self.own_args)
+        keys = own_arrays[:num_keys]
         own_args = None
         if self.own_args:
             treedef = jtu.tree_structure(eqx.filter(system.args, eqx.is_array))
-            own_args = jtu.tree_unflatten(treedef, own[num_keys:])
+            own_args = jtu.tree_unflatten(treedef, own_arrays[num_keys:])
         return system.with_args(own_args), with_keys(system.terms, keys)
 
 

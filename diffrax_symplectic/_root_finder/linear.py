@@ -13,7 +13,7 @@ import optimistix as optx
 from jax import lax
 from jaxtyping import Array, Bool, Float, Scalar
 
-from .._compat import computed_by
+from .._compat import linear_solution
 from .._custom_types import IntScalarLike
 
 
@@ -100,7 +100,7 @@ def solve(
     size = _largest_or_one(rhs)
     operator = lx.FunctionLinearOperator(apply, jax.eval_shape(lambda: rhs))
     # `lx.linear_solve`, without its derivatives.
-    x, result = computed_by(solver, operator, rhs / size)
+    x, result = linear_solution(solver, operator, rhs / size)
     return LinearSolution(x * size, result == lx.RESULTS.successful)
 
 

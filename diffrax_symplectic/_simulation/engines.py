@@ -180,7 +180,7 @@ def _fused_batch(
 
 class FusedStart(NamedTuple):
     """The paths of a batch before their first step, and the kernels that take their steps:
-    `kernels.advance(lanes, shared, begin, end)`.
+    `kernels.advance(lanes, shared, first_step, end_step)`.
     """
 
     kernels: Kernels
@@ -206,7 +206,7 @@ def fused_start(
     else:
         y0 = problem.y0
         own_args = None
-    lanes, shared = kernels.begin(
+    lanes, shared = kernels.lanes_and_shared(
         arrays,
         key,
         h=problem.level(level).h,

@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
 from .._arguments import check_pair
-from .._compat import replaced, unwrapped
+from .._compat import unwrapped, wrapped_like
 from .._custom_types import Args, RealScalarLike, Terms, Y
 from .._terms import (
     apply,
@@ -225,7 +225,7 @@ def _kicks_and_rest(flow: Flow, terms: diffrax.AbstractTerm) -> tuple[Terms, Ter
     kicks, rest = kicks_and_rest(flow, drift)
     # The flow finds the constraint of the terms at the first of them.
     first, *others = rest
-    first = replaced(first, with_constraint(unwrapped(first), constraint_of(terms)))
+    first = wrapped_like(first, with_constraint(unwrapped(first), constraint_of(terms)))
     return kicks, (first, *others)
 
 

@@ -41,10 +41,10 @@ from .operation import NotReplayed
 from .replay import Replay
 from .tensor import (
     ArrayType,
-    chosen,
+    elements_where,
     entries_of,
     array_in_memory,
-    merged,
+    elements_of_both,
     MOST_IN_REGISTERS,
     scalar,
 )

@@ -8,11 +8,11 @@ from .mlir import block_of, call_target, operations_in
 from .operation import Operation, rule
 from .tensor import (
     as_own_literal,
-    chosen,
     copied_entries,
+    elements_of_both,
+    elements_where,
     entries_of,
     known_values,
-    merged,
     Tensor,
     tensors_from,
 )
@@ -140,7 +140,7 @@ _MOST_UNROLLED_OF_INDICES = 32
 @rule
 def _while(operation: Operation, *xs: Tensor) -> list[Tensor]:
     changes = _which_change(operation)
-    changing_entries = entries_of(chosen(xs, changes))
+    changing_entries = entries_of(elements_where(xs, changes))
     has_only_indices = not any(map(drjit().is_float_v, changing_entries))
     most = _MOST_UNROLLED_OF_INDICES if has_only_indices else _MOST_UNROLLED
     state = [*xs]
@@ -171,12 +171,12 @@ def _loop(
     """The state at the end of a loop of the kernel, which starts from `state`. `changes`
     says which values of the state the loop's body changes."""
     # Values that do not change stay out of the loop's state, so that constants stay known.
-    variables = chosen(state, changes)
-    constants = chosen(state, [not change for change in changes])
+    variables = elements_where(state, changes)
+    constants = elements_where(state, [not change for change in changes])
     shapes = [x.shape for x in variables]
 
     def whole_state(entries: Iterable[Any]) -> list[Tensor]:
-        return merged(changes, tensors_from(entries, shapes), constants)
+        return elements_of_both(changes, tensors_from(entries, shapes), constants)
 
     # Beside the entries, Dr.Jit's loop has in its state the mask of the lanes that failed
     # so far.
@@ -192,7 +192,7 @@ def _loop(
         new_state, fails_now = operation.with_failures(
             lambda: operation.run(_BODY, whole_state(entries))
         )
-        return failed | fails_now, *copied_entries(chosen(new_state, changes))
+        return failed | fails_now, *copied_entries(elements_where(new_state, changes))
 
     # Where no lane can fail, Dr.Jit leaves the mask out.
     no_lane = array_types()["i1"](False)

@@ -97,10 +97,12 @@ def attribute_part(op: Any, name: str, key: str) -> list[int]:
 
 def constant_values(op: Any) -> np.ndarray:
     """The values of a constant of StableHLO, in its own shape."""
-    type_of_result = op.results[0].type
-    shape = tuple(type_of_result.shape)
-    if str(type_of_result.element_type).startswith("complex"):
+    result_type = op.results[0].type
+    shape = tuple(result_type.shape)
+    if str(result_type.element_type).startswith("complex"):
         return _complex_constant(str(op), shape)
+    # Of a constant of equal entries MLIR stores one entry, and does not promise to hand out
+    # all of them.
     return np.broadcast_to(np.asarray(op.attributes["value"]), shape)
 
 

@@ -118,10 +118,10 @@ class Replay:
                 # An operation in a called function has no location in its caller.
                 error.location += str(op.location)
                 raise
-        # A large constant.
+        # A large constant stays in memory, where the caller has put it.
         if op.results and op.results[0] in self._memory:
             return [self._table(op.results[0])]
-        # Arrays without entries need no rule, whatever the operation.
+        # Rules need not treat results without entries: there is nothing to compute.
         if op.results and all(map(_is_empty, op.results)):
             return [Tensor([], tuple(result.type.shape)) for result in op.results]
 

@@ -189,16 +189,16 @@ def as_own_literal(entry: Any) -> Any:
     return type(entry)(entry[0]) if is_literal(entry) else entry
 
 
-def chosen(xs: Sequence[Any], mask: Sequence[bool]) -> list[Any]:
+def elements_where(xs: Sequence[Any], mask: Sequence[bool]) -> list[Any]:
     """The elements of `xs` where the mask is true."""
-    return [x for x, is_chosen in zip(xs, mask, strict=True) if is_chosen]
+    return [x for x, is_true in zip(xs, mask, strict=True) if is_true]
 
 
-def merged(
+def elements_of_both(
     mask: Sequence[bool], where_true: Iterable[Any], where_false: Iterable[Any]
 ) -> list[Any]:
-    """One list of two, as long as the mask: the next element of `where_true` where it is
-    true, and of `where_false` elsewhere. The inverse of `chosen`."""
+    """One list of two, as long as the mask: the next element of `where_true` where the mask
+    is true, and of `where_false` elsewhere. `elements_where` takes them apart again."""
     true_elements = iter(where_true)
     false_elements = iter(where_false)
     return [next(true_elements if is_true else false_elements) for is_true in mask]

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
-from .._arguments import check_takes, real_array
+from .._arguments import check_takes, checked_not_negative
 from .hamiltonian import hamiltonian_terms
 from .symplectic_gradients import IndexedNoise
 
@@ -71,8 +71,8 @@ def checked_damping(each: str, alpha: ArrayLike) -> ArrayLike:
     """The damping `alpha` in an array: a number, or one for each vector that is damped,
     such as "each spin" for `each`. Raises a `ValueError` if it is known to be negative or
     not finite."""
-    return real_array(
-        "damping", alpha, kind=f"a number, or an array with one for {each}"
+    return checked_not_negative(
+        "damping", alpha, expected=f"a number, or an array with one for {each}"
     )
 
 

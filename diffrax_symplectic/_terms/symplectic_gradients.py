@@ -16,7 +16,7 @@ from jaxtyping import Array, PyTree, Shaped
 
 from .._arguments import check_pair, shapes, whole_number
 from .._brownian import increment_struct
-from .._compat import replaced, ω
+from .._compat import wrapped_like, ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike, Terms
 from .dependence import Dependence
 from .drift_and_noise import field_of
@@ -140,9 +140,9 @@ def slow_apart(drift: Terms) -> tuple[Terms, Terms]:
         field = field_of(term)
         if isinstance(field, Drift) and field.slow is not None:
             fast = dataclasses.replace(field, slow=None)
-            # `replaced` keeps the direction of time, which Diffrax wraps around each term.
-            rest.append(replaced(term, diffrax.ODETerm(fast)))
-            slow.append(replaced(term, diffrax.ODETerm(SlowForce(field.slow))))
+            # This keeps the direction of time, which Diffrax wraps around each term.
+            rest.append(wrapped_like(term, diffrax.ODETerm(fast)))
+            slow.append(wrapped_like(term, diffrax.ODETerm(SlowForce(field.slow))))
         else:
             rest.append(term)
     return tuple(rest), tuple(slow)

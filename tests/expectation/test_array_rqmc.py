@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation.sorted.array_rqmc import step_words
+from diffrax_symplectic._expectation.sorted.array_rqmc import word_layout
 from diffrax_symplectic._simulation import loop
 from diffrax_symplectic._simulation.levels import level_weights
 
@@ -234,7 +234,7 @@ def test_equal_paths_are_one_brownian_motion():
     other = ds.WeakBrownianPath((2,), jr.key(1), two_point=True)
     term = lambda path: diffrax.ControlTerm(lambda t, y, args: y, path)
     terms = diffrax.MultiTerm(term(path), term(other), term(path))
-    assert step_words(terms) == (((0, 4), (4, 8), (0, 4)), 8, False)
+    assert word_layout(terms) == (((0, 4), (4, 8), (0, 4)), 8, False)
 
 
 @pytest.mark.parametrize(

@@ -271,6 +271,7 @@ class Expectation(eqx.Module):
 
     def __str__(self) -> str:
         lines = self._lines_of_means()
+        # Only the trials that choose a sampling have none themselves.
         if self.levels == 1 and self.sampling is not None:
             lines.append("not included: the discretization error (see `levels`)")
         if self.levels == 2:
@@ -280,11 +281,12 @@ class Expectation(eqx.Module):
                 "the changes from step to step do not fit the order: the largest of them "
                 "is taken for the error (take smaller steps)"
             )
-        levels = "1 level" if self.levels == 1 else f"{self.levels} levels"
-        paths = f"{self.num_paths:,} paths on {levels}, {self.num_failed:,} failed"
-        if self.sampling is not None:
-            paths += f", {self.sampling}"
-        lines.append(paths)
+        plural = "" if self.levels == 1 else "s"
+        sampling = "" if self.sampling is None else f", {self.sampling}"
+        lines.append(
+            f"{self.num_paths:,} paths on {self.levels} level{plural}, "
+            f"{self.num_failed:,} failed{sampling}"
+        )
         if self.reason:
             lines.append(self.reason)
         if self.tol_reached is False:

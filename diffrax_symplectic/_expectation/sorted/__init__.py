@@ -5,4 +5,4 @@
 - `hilbert`: the order of paths, along Hilbert's curve.
 """
 
-from .array_rqmc import ArrayRQMC, step_words
+from .array_rqmc import ArrayRQMC, word_layout

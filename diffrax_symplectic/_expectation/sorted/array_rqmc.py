@@ -117,7 +117,7 @@ class ArrayRQMC(AbstractSampling):
     sort_by: Callable[[Y], PyTree[ArrayLike]] | None = None
 
     def prepare(self, problem, key, devices):
-        layout = step_words(problem.terms)
+        layout = word_layout(problem.terms)
         if not 0 < layout.num_words <= _MAX_DIMENSION:
             raise ValueError(
                 f"`terms` need {layout.num_words:,} random variables in each step; "
@@ -146,7 +146,7 @@ def _samples_of_replicate(
     problem: Problem,
     sort_by: Callable[[Y], PyTree[Array]],
     points: UInt32[Array, "n d"],
-    layout: "StepWords",
+    layout: "WordLayout",
     keys: Key[Array, "1"],
 ) -> Samples:
     """A sample is the mean over all paths of a replicate, by algorithm 1 of
@@ -163,6 +163,9 @@ def _samples_of_replicate(
     starts = jax.vmap(problem.draw_start)(start_keys)
 
     def motion_on(level: Level) -> Motion:
+        """The motion of all paths, which are sorted before each step."""
+        # Given their words, paths move independently. Only the words are coupled: a sorted
+        # path gets those of its place in the order.
         motion = independent_motion(
             problem,
             level,
@@ -201,7 +204,7 @@ def _words_of_paths(
     replicate_key: PRNGKeyArray,
     level: Level,
     points: UInt32[Array, "n d"],
-    layout: "StepWords",
+    layout: "WordLayout",
     i: Any,
 ) -> UInt32[Array, "n d"]:
     """The random words of each path in step `i`: the points, scrambled anew."""
@@ -249,7 +252,7 @@ def _statistics(phi: Float[Array, "n m"], failed: Bool[Array, " n"]) -> Array:
     return jnp.stack([mean, r, largest])
 
 
-class StepWords(NamedTuple):
+class WordLayout(NamedTuple):
     """Which random words of a step each Brownian path in `terms` takes.
 
     - `slices`: the first word of each path, and one past the last.
@@ -263,9 +266,10 @@ class StepWords(NamedTuple):
     is_one_three_point_variable: bool
 
 
-def step_words(terms: PyTree[diffrax.AbstractTerm]) -> StepWords:
-    """The words of a step. Equal paths are one Brownian motion, and take the same words.
-    Raises a `ValueError` for a path whose increments cannot be computed from words."""
+def word_layout(terms: PyTree[diffrax.AbstractTerm]) -> WordLayout:
+    """The layout of the words of a step. Equal paths are one Brownian motion, and take the
+    same words. Raises a `ValueError` for a path whose increments cannot be computed from
+    words."""
     paths = [checked_stepwise(path) for path in brownian_paths(terms)]
     # The first word of each Brownian motion, by its number.
     first_words: dict[int, int] = {}
@@ -278,15 +282,15 @@ def step_words(terms: PyTree[diffrax.AbstractTerm]) -> StepWords:
         slices.append((start, end))
         num_words = max(num_words, end)
     is_one_three_point = num_words == 1 and paths[0].laws == {"W": THREE_POINT}
-    return StepWords(tuple(slices), num_words, is_one_three_point)
+    return WordLayout(tuple(slices), num_words, is_one_three_point)
 
 
 def with_words(
     terms: PyTree[diffrax.AbstractTerm],
-    layout: StepWords,
+    layout: WordLayout,
     words: UInt32[Array, " num_words"],
 ) -> PyTree[diffrax.AbstractTerm]:
-    """The terms, with paths whose increments are computed from these words."""
+    """The terms, with paths whose increments are computed from these words of one step."""
     # `replace_paths` visits paths in the order of `brownian_paths`.
     slices = iter(layout.slices)
 

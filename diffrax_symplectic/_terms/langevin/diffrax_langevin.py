@@ -10,7 +10,7 @@ import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
 from ..._arguments import check_pair
-from ..._compat import replaced, unwrapped
+from ..._compat import unwrapped, wrapped_like
 from ..._custom_types import Args, RealScalarLike
 from ..drift_and_noise import flattened
 from .friction import in_precision_of, not_negative
@@ -32,7 +32,7 @@ def momentum_first(
         return terms, y
     check_pair(y)
     x, v = y
-    exchanged = [replaced(term, _exchanged(unwrapped(term))) for term in parts]
+    exchanged = [wrapped_like(term, _exchanged(unwrapped(term))) for term in parts]
     return diffrax.MultiTerm(*exchanged), (v, x)
 
 

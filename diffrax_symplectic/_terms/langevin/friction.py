@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
-from ..._arguments import check_takes, real_array, shapes
+from ..._arguments import check_takes, checked_not_negative, shapes
 from ..._compat import is_traced
 from ..._custom_types import Args, BM, RealScalarLike
 from ..evaluation import call_user_function
@@ -25,7 +25,7 @@ Value = (
     PyTree[ArrayLike] | Callable[[RealScalarLike, _Momenta, Args], PyTree[ArrayLike]]
 )
 
-_KIND = "a real number, an array or PyTree of them, or a function of `(t, q, args)`"
+_EXPECTED = "a real number, an array or PyTree of them, or a function of `(t, q, args)`"
 
 
 class FrictionAlong(eqx.Module):
@@ -363,7 +363,9 @@ def _checked_array(
         _check_fits_path(friction, momenta_shape)
         is_matrix = _is_matrix(friction, momenta_shape)
     if not may_be_matrix:
-        return jnp.asarray(real_array("friction", friction, kind=_KIND))
+        return jnp.asarray(
+            checked_not_negative("friction", friction, expected=_EXPECTED)
+        )
     root = semidefinite_root(jnp.asarray(friction, jnp.result_type(friction, float)))
     is_semidefinite = ~jnp.any(jnp.isnan(root))
     matrix_or_numbers = _MatrixOrNumbers(jnp.asarray(friction), is_semidefinite, root)
@@ -386,7 +388,7 @@ def checked_temperature(temperature: Any) -> Any:
         return temperature
 
     def checked(T: ArrayLike) -> Array:
-        return jnp.asarray(real_array("temperature", T, kind=_KIND))
+        return jnp.asarray(checked_not_negative("temperature", T, expected=_EXPECTED))
 
     return jtu.tree_map(checked, temperature)
 

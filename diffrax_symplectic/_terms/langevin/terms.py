@@ -14,7 +14,7 @@ from jaxtyping import Array, PyTree
 
 from ..._arguments import check_pair, check_takes
 from ..._brownian import increment_struct, TruncatedBrownianPath, zeros_and_unravel
-from ..._compat import replaced, ω
+from ..._compat import wrapped_like, ω
 from ..._custom_types import Args, BM, RealScalarLike, Terms
 from ..constrained_drift import Constraint, with_constraint
 from ..drift_and_noise import field_of, split_terms
@@ -177,9 +177,9 @@ def friction_apart(drift: Terms) -> tuple[Terms, Terms]:
     for term in drift:
         field = field_of(term)
         if isinstance(field, DriftWithFriction):
-            # `replaced` keeps the direction of time, which Diffrax wraps around each term.
-            rest.append(replaced(term, diffrax.ODETerm(field.drift)))
-            friction.append(replaced(term, diffrax.ODETerm(field.friction)))
+            # This keeps the direction of time, which Diffrax wraps around each term.
+            rest.append(wrapped_like(term, diffrax.ODETerm(field.drift)))
+            friction.append(wrapped_like(term, diffrax.ODETerm(field.friction)))
         elif isinstance(field, AbstractFriction):
             friction.append(term)
         else:
