@@ -495,27 +495,37 @@ def _suggestion(
     increments. `terms_with(make_path)` returns, as a function of a key, the terms with
     paths that are made by `make_path`."""
     record = _record(solver)
-    random = random_paths(terms)
-    replaced = [path for path in random if not has_unknown_law(path)]
-    if replaced:
-        struct = increment_struct(replaced[0])
-        shape = _shape_code(struct)
-        path_code = f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
-        made = solver.path(struct, jr.key(0), want=want)
-        if isinstance(made, TruncatedBrownianPath) and not needs_bounded:
-            path_code = f"ds.FixedStepBrownianPath({shape}, key)"
-    elif random:
-        path_code = f"the `{type(random[0]).__name__}` of the terms, with another key"
-    else:
-        path_code = "the path of the terms, which holds given noise"
     return Suggestion(
         solver=solver,
         weak_order=cast(int, record.order("weak", commute)),
         strong_order=record.order("strong", commute),
-        path=path_code,
+        path=_path_code(solver, want, terms, needs_bounded),
         reason=record.reason,
         terms=terms_with(ft.partial(solver.path, want=want)),
     )
+
+
+def _path_code(
+    solver: AbstractSymplecticSolver,
+    want: Want,
+    terms: diffrax.AbstractTerm,
+    needs_bounded: bool,
+) -> str:
+    """The code, or the words, for the paths of a suggestion. Of several paths the first one
+    stands for all, which differ in their shapes at most."""
+    random_noise = random_paths(terms)
+    replaceable = [path for path in random_noise if not has_unknown_law(path)]
+    if replaceable:
+        struct = increment_struct(replaceable[0])
+        shape = _shape_code(struct)
+        # The solver decides, so an example of its paths is made.
+        path = solver.path(struct, jr.key(0), want=want)
+        if isinstance(path, TruncatedBrownianPath) and not needs_bounded:
+            return f"ds.FixedStepBrownianPath({shape}, key)"
+        return f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
+    if random_noise:
+        return f"the `{type(random_noise[0]).__name__}` of the terms, with another key"
+    return "the path of the terms, which holds given noise"
 
 
 def _shape_code(shape: PyTree[jax.ShapeDtypeStruct]) -> str:
