@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
-from ._compat import captured_arrays, is_traced
+from ._compat import is_traced, with_captured_arrays
 from ._custom_types import IntScalarLike
 
 
@@ -122,7 +122,7 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
     Here the stragglers (`pending` paths) are gathered from the batch and served in groups.
     """
     # `fn` is traced once, here: under `vmap`, `jax.jit` would trace it again.
-    call, arrays = captured_arrays(fn, value)
+    call, arrays = with_captured_arrays(fn, value)
     # Each level of nested batches runs the same program.
     in_groups = jax.jit(ft.partial(_in_groups, call))
 

@@ -199,7 +199,7 @@ def compare_solvers(
     multiple of the smallest, if `phi` does not return one number, or if a solver is not a
     Diffrax solver.
     """
-    dts = _steps_as_floats(t0, t1, dt0)
+    dts = _checked_dts(t0, t1, dt0)
     want = "strong" if phi is None else "weak"
     terms = shapes_as_paths(terms)
     suggestions = suggest_solver(terms, t0, y0, args, want=want)
@@ -408,17 +408,19 @@ def _check_scalar(phi: Any, t: RealScalarLike, y0: Y, args: Args) -> None:
         raise ValueError(f"`phi` must return one number; got shape {shapes(result)}.")
 
 
-def _steps_as_floats(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
-    """The step sizes, as numbers of Python. Raises a `ValueError` unless each divides the
-    interval, and is a multiple of the smallest, so that all follow one Brownian motion."""
+def _checked_dts(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
+    """The step sizes `dts`, as numbers of Python. Raises a `ValueError` unless each is
+    positive, divides the interval, and is a multiple of the smallest, so that all follow
+    one Brownian motion."""
     if not t1 > t0:
         raise ValueError(f"`t1` must be after `t0`; got t0={t0!r} and t1={t1!r}.")
     if np.ndim(dts) != 1 or len(dts) == 0:
         raise ValueError(f"`dt0` must be a list of step sizes; got {dts!r}.")
+    smallest = min(dts)
+    if not smallest > 0:
+        raise ValueError(f"Every step in `dt0` must be positive; got {smallest}.")
     for dt in dts:
-        # Zero comes first, since nothing can be divided by it.
-        is_allowed = dt != 0 and _is_whole((t1 - t0) / dt) and _is_whole(dt / min(dts))
-        if not is_allowed:
+        if not (_is_whole((t1 - t0) / dt) and _is_whole(dt / smallest)):
             raise ValueError(
                 f"Every step in `dt0` must divide the interval from {t0} to {t1} and be a "
                 f"multiple of the smallest; got {dt}. Take for example "

@@ -172,9 +172,10 @@ def is_adjoint_term(term: diffrax.AbstractTerm) -> bool:
     return isinstance(unwrapped(term), AdjointTerm)
 
 
-def captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[Any]]:
+def with_captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[Any]]:
     """`fn(value)` as a function of `value` and of the arrays that `fn` captures; and these.
-    (`eqx.filter_closure_convert` checks types that `shard_map` changes.)"""
+    (`eqx.filter_closure_convert` would refuse them under `shard_map`, which changes the
+    types that it checks.)"""
     traced, struct = jax.make_jaxpr(fn, return_shape=True)(value)
     treedef = jtu.tree_structure(struct)
 
@@ -331,8 +332,8 @@ class StepTimes(NamedTuple):
         _, *other_state = self.init_state.controller_state
         initial_time = self.init_state.tprev
         time_after_first_step = self.init_state.tnext
-        # The controller computes times from the number of steps alone: the other arguments
-        # do not matter.
+        # The controller computes times from the number of steps in its state alone, and
+        # returns the step size that `t0` and `t1` give beside them, which is not used.
         _, _, time_after_step, *_ = self.controller.adapt_step_size(
             t0=initial_time,
             t1=time_after_first_step,
@@ -343,6 +344,8 @@ class StepTimes(NamedTuple):
             error_order=1,
             controller_state=(i - 1, *other_state),
         )
+        # The first step of the controller ends at `t0 + dt0`, all later ones at fractions
+        # of the interval: these differ by rounding.
         return jnp.where(i == 1, time_after_first_step, time_after_step)
 
     def solver_state(self) -> Any:

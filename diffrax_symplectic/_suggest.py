@@ -444,7 +444,7 @@ def ranked(
         # In a separable system only half of the state is solved for.
         cost = sum(stage_vectors) / (2 if solver.structure == "separable" else 1)
         is_costly = cost > _MOST_STAGE_VECTORS
-        is_wrong_on_stiff_modes = record.heats is False
+        is_wrong_on_stiff_modes = record.right_energy_unresolved is False
         largest_system = max(stage_vectors, default=0)
         return (
             is_inexact,

@@ -42,14 +42,14 @@ def test_facts_about_noise_on_harmonic_modes_are_measured(kind):
     solver = advice.with_newton(kind())
     path = kind().path((), jr.key(0), want="weak")
     # The energy that noise gives in each unit of time to a mode without friction is 1/2.
-    heats = None
+    right_energy_unresolved = None
     if kind not in EXPLICIT:
         push = lambda t, p, q, args: -q
         terms = ds.hamiltonian_terms(_well, push, path)
         ends = np.linalg.matrix_power(_maps(terms, solver, STIFF), 200)[:, :, 0]
         rates = (ends[:, 4] + ends[:, 8]) / (200 * STIFF)
-        heats = bool(np.all(np.abs(rates - 1) <= 0.05))
-    assert kind().record.heats is heats
+        right_energy_unresolved = bool(np.all(np.abs(rates - 1) <= 0.05))
+    assert kind().record.right_energy_unresolved is right_energy_unresolved
     # Those for separable systems do not take friction in the drift.
     exact = []
     if kind in LANGEVIN or kind().structure not in ("separable",):
@@ -187,7 +187,7 @@ def test_without_brackets_levy_areas_change_nothing(h):
         ends.append(jnp.stack(y1))
     np.testing.assert_allclose(*ends, rtol=0, atol=1e-13)
     of_levy, of_midpoint = ds.LevyAreaMidpoint.record, ds.ImplicitMidpoint.record
-    assert of_levy.heats is of_midpoint.heats
+    assert of_levy.right_energy_unresolved is of_midpoint.right_energy_unresolved
     assert of_levy.stationary == of_midpoint.stationary
 
 

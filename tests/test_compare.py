@@ -90,7 +90,9 @@ def test_weak_error_is_within_its_bars():
     assert abs(step.error - exact) < 5 * step.std_error
 
 
-@pytest.mark.parametrize("dts", [[0.3], [0.5, 1 / 3], [], [0.0], [-0.5]])
+@pytest.mark.parametrize(
+    "dts", [[0.3], [0.5, 1 / 3], [], [0.0], [0.5, 0.0], [-0.5], [np.nan], [0.5, np.nan]]
+)
 def test_steps_that_do_not_divide_the_interval_are_refused(dts):
     with pytest.raises(ValueError, match="`dt0`"):
         ds.compare_solvers(_terms(), None, 0.0, 1.0, dts, Y0, key=jr.key(0))

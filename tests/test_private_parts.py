@@ -231,11 +231,11 @@ def test_what_takes_long_to_import_is_imported_when_it_is_needed():
 
 
 def test_a_function_takes_other_arrays_in_place_of_the_captured_ones():
-    """If this fails: `captured_arrays` needs another way from a jaxpr with constants to a
-    function. `eqx.filter_closure_convert` is one, where types do not change."""
+    """If this fails: `with_captured_arrays` needs another way from a jaxpr with constants
+    to a function. `eqx.filter_closure_convert` is one, where types do not change."""
     captured = jnp.arange(3.0)
     fn = lambda value: {"sum": value["x"] + captured, "x": value["x"]}
-    call, arrays = _compat.captured_arrays(fn, {"x": jnp.ones(3)})
+    call, arrays = _compat.with_captured_arrays(fn, {"x": jnp.ones(3)})
     assert len(arrays) == 1
     out = call({"x": jnp.zeros(3)}, [jnp.full(3, 2.0)])
     assert out["sum"].tolist() == [2.0] * 3 and out["x"].tolist() == [0.0] * 3

@@ -157,8 +157,8 @@ class TruncatedBrownianPath(AbstractWrappedPath):
             h_in_units = h / jnp.asarray(self.unit, h.dtype)
         h_in_units = eqx.error_if(h_in_units, h_in_units >= 1, STEP_BEYOND_UNIT)
         # The bound of an empty step is zero.
-        log_h = jnp.log(jnp.where(h_in_units > 0, h_in_units, 1))
-        bound = jnp.sqrt(2 * self.k * h * jnp.abs(log_h))
+        log_h_in_units = jnp.log(jnp.where(h_in_units > 0, h_in_units, 1))
+        bound = jnp.sqrt(2 * self.k * h * jnp.abs(log_h_in_units))
 
         def clip(w: Array) -> Array:
             return jnp.clip(w, -bound.astype(w.dtype), bound.astype(w.dtype))

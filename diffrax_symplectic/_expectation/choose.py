@@ -179,7 +179,7 @@ def sampling_for(
     size = f"{num_components} components of the state, {_num_steps(problem):,} steps"
     if num_outcomes:
         size += f" of {num_outcomes} outcomes each"
-    if _can_be_fitted(problem, num_outcomes):
+    if _suits_value_functions(problem, num_outcomes):
         sampling = ValueFunctions(num_paths=_MOST_SAMPLES) if tol else ValueFunctions()
         return sampling, f"value functions for {size}"
     sampling = array_rqmc_for(problem, tol)
@@ -201,7 +201,7 @@ def _independent_sampling(problem: Problem, tol: float | None) -> IndependentPat
 def array_rqmc_for(problem: Problem, tol: float | None) -> ArrayRQMC | None:
     """As many sorted paths as there is time for; `None` if sorting does not help or is not
     possible."""
-    if not _can_be_sorted(problem):
+    if not _suits_sorting(problem):
         return None
     default = ArrayRQMC()
     # The operations of each step, for one more path in every replicate.
@@ -226,7 +226,7 @@ def _affordable_operations(problem: Problem) -> float:
 def trial_sampling(problem: Problem) -> AbstractSampling:
     """The sampling for a trial of a few seconds: the most accurate one that takes Gaussian
     increments, too."""
-    if _can_be_sorted(problem):
+    if _suits_sorting(problem):
         return ArrayRQMC(_PATHS_OF_SORTED_TRIAL, replicates=_REPLICATES_OF_TRIAL)
     return IndependentPaths(_PATHS_OF_TRIAL)
 
@@ -240,8 +240,10 @@ def _num_steps(problem: Problem) -> int:
     return int(np.sum(problem.levels.num_steps))
 
 
-def _can_be_fitted(problem: Problem, num_outcomes: int | None) -> bool:
-    """Whether value functions are the best choice, as far as it is known without a fit."""
+def _suits_value_functions(problem: Problem, num_outcomes: int | None) -> bool:
+    """Whether value functions are the best choice, as far as it is known without a fit.
+    `num_outcomes` is how many outcomes the noise of a step has, `None` if not finitely
+    many."""
     # Value functions leave the variance of random starts, for which their few paths do not
     # suffice.
     if problem.paths_differ or not num_outcomes:
@@ -253,7 +255,7 @@ def _can_be_fitted(problem: Problem, num_outcomes: int | None) -> bool:
     )
 
 
-def _can_be_sorted(problem: Problem) -> bool:
+def _suits_sorting(problem: Problem) -> bool:
     """Whether sorting paths helps, and does not take long."""
     if _num_components(problem) > _MOST_COMPONENTS_SORTED:
         return False

@@ -78,7 +78,7 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         choose="Accurate paths; the noise may depend on time. Two stage vectors, one after "
         "the other.",
         suggested=("weak", "strong"),
-        heats=True,
+        right_energy_unresolved=True,
         most_friction=1.0,
     )
     beta1: float = free_parameter("beta1", 0.0)
@@ -132,7 +132,7 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=None,
         choose="As cheap as the midpoint rule, for low accuracy.",
         suggested=("weak",),
-        heats=True,
+        right_energy_unresolved=True,
         most_friction=0.5,
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(
@@ -184,7 +184,7 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         "has them exactly), or for `ValueFunctions` in strongly nonlinear systems (36 "
         "outcomes per step).",
         suggested=("weak",),
-        heats=True,
+        right_energy_unresolved=True,
         most_friction=2.0,
     )
     tableau: ClassVar[AdditiveTableau] = AdditiveTableau(

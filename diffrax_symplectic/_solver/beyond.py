@@ -66,7 +66,7 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         "Not for long steps, omega h > 1.",
         noises="commuting",
         suggested=("weak",),
-        heats=True,
+        right_energy_unresolved=True,
         most_friction=0.5,
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau(
@@ -141,7 +141,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         choose="For few noises: two stage vectors per noise, and four for the drift.",
         noises="not commuting",
         suggested=("weak",),
-        heats=True,
+        right_energy_unresolved=True,
         most_friction=0.5,
     )
     structure: ClassVar[Structure] = "any"
@@ -273,7 +273,7 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         noises="not commuting",
         suggested=("strong",),
         stationary=("qq", "pq", "pp"),
-        heats=False,
+        right_energy_unresolved=False,
     )
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(
         ImplicitMidpoint.tableau, noise=("W", "A")
@@ -325,7 +325,7 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         noises="commuting",
         suggested=("strong",),
         stationary=("qq", "pq", "pp"),
-        heats=False,
+        right_energy_unresolved=False,
     )
     tableau: ClassVar[GeneralTableau] = dataclasses.replace(
         GeneralTableau.strong(A=GAUSS, B=GAUSS, alpha=_HALVES, beta=_HALVES),

@@ -34,7 +34,7 @@ class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         choose="A good first choice: one stage vector for any number of noises.",
         suggested=("strong",),
         stationary=("qq", "pq", "pp"),
-        heats=False,
+        right_energy_unresolved=False,
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau.strong(
         A=[[1 / 2]], B=[[1 / 2]], alpha=[1], beta=[1]
@@ -64,7 +64,7 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=1,
         strong=(1, 1 / 2),
         choose="Two midpoint substeps, for errors dominated by the drift.",
-        heats=False,
+        right_energy_unresolved=False,
     )
     a: float = free_parameter("a", 0.25)
 
@@ -101,14 +101,14 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         choose="The midpoint rule for expectations. Cheap, for low accuracy.",
         suggested=("weak",),
         stationary=("qq", "pq", "pp"),
-        heats=False,
+        right_energy_unresolved=False,
     )
     b: float = free_parameter("b", 0.5)
 
     @property
     def tableau(self) -> GeneralTableau:
-        # Symplectic for any b: A0 and B1 are half the product of the weights, which is 1,
-        # and A1 + B0 are all of it.
+        # Symplectic for any b: with one stage of each kind the conditions are
+        # alpha^2 = 2 alpha A0, beta^2 = 2 beta B1 and alpha beta = alpha B0 + beta A1.
         return GeneralTableau(
             alpha=[1],
             beta=[1],

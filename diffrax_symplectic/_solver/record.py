@@ -20,8 +20,8 @@ class Record(NamedTuple):
     - `suggested`: the kinds of convergence for which `suggest_solver` returns it.
     - `stationary`: the second moments, of `"qq"`, `"pq"` and `"pp"`, of a harmonic mode in
         a heat bath whose stationary values are exact for every stable step.
-    - `heats`: whether noise gives a harmonic mode without friction the right energy for
-        steps that do not resolve it; `None` if such steps are unstable.
+    - `right_energy_unresolved`: whether noise gives a harmonic mode without friction the
+        right energy for steps that do not resolve it; `None` if such steps are unstable.
     - `most_friction`: the greatest friction, as a rate times the step, up to which the
         stationary energies of a resolved harmonic mode in a heat bath are within a tenth,
         of those in `examples/stability/friction.py`; `None` if there is no limit. Given
@@ -39,18 +39,18 @@ class Record(NamedTuple):
     noises: Noises = "any"
     suggested: tuple[Want, ...] = ()
     stationary: tuple[str, ...] = ()
-    heats: bool | None = None
+    right_energy_unresolved: bool | None = None
     most_friction: float | None = None
 
     @property
     def reason(self) -> str:
-        """When to choose it, and its limits by `heats` and `most_friction`, in sentences
-        for users."""
+        """When to choose it, and its limits by `right_energy_unresolved` and
+        `most_friction`, in sentences for users."""
         sentences = [self.choose]
         # If stationary momenta are exact, a heat bath corrects the energy.
-        if self.heats is False and "pp" in self.stationary:
+        if self.right_energy_unresolved is False and "pp" in self.stationary:
             sentences.append("If noise drives stiff modes, only in a heat bath.")
-        elif self.heats is False:
+        elif self.right_energy_unresolved is False:
             sentences.append("Not if noise drives stiff modes.")
         if self.most_friction is not None:
             limit = f"{self.most_friction:g}"

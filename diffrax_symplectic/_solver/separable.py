@@ -112,7 +112,7 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=None,
         choose="Solves for half of the state. For stiff systems.",
         suggested=("weak",),
-        heats=False,
+        right_energy_unresolved=False,
     )
     a21: float = free_parameter("a21", 0.5)
 
@@ -147,7 +147,7 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=1,
         choose="The midpoint rule on half of the state. For stiff systems.",
         suggested=("strong",),
-        heats=False,
+        right_energy_unresolved=False,
     )
     tableau: ClassVar[SeparableTableau] = SeparableTableau(
         alpha=[1], beta=[1], A0=[[1 / 2]], B0=[[1 / 2]], A1=[[1 / 2]]

@@ -32,36 +32,36 @@ class Table(Sequence):
     memory. An entry is read where a rule asks for it; each path may ask for its own.
 
     - `memory`: the array of Dr.Jit, in its own order.
-    - `places`: where in `memory` the entries are.
+    - `addresses`: where in `memory` the entries are.
     - `values`: the values in `memory` if these are constants of the program, so that
         operations with them can be folded.
     """
 
     def __init__(
-        self, memory: Any, places: np.ndarray, values: np.ndarray | None = None
+        self, memory: Any, addresses: np.ndarray, values: np.ndarray | None = None
     ):
         self.memory = memory
-        self.places = places
+        self.addresses = addresses
         self.values = values
 
     def __len__(self) -> int:
-        return len(self.places)
+        return len(self.addresses)
 
     def __getitem__(self, i: Any) -> Any:
         if isinstance(i, slice):
             return self.at_places(np.arange(len(self))[i])
-        place = int(self.places[i])
+        address = int(self.addresses[i])
         if self.values is not None:
             # A constant of the kernel, which costs no read of memory.
-            return type(self.memory)(self.values[place].item())
-        return self.gathered(array_types()["ui32"](place))
+            return type(self.memory)(self.values[address].item())
+        return self.gathered(array_types()["ui32"](address))
 
     def at_places(self, places: np.ndarray) -> "Table":
-        return Table(self.memory, self.places[places], self.values)
+        return Table(self.memory, self.addresses[places], self.values)
 
-    def gathered(self, places: Any) -> Any:
-        """What is at these places of `memory`, one for each path."""
-        return drjit().gather(type(self.memory), self.memory, places)
+    def gathered(self, addresses: Any) -> Any:
+        """What is at these addresses in `memory`, one for each path."""
+        return drjit().gather(type(self.memory), self.memory, addresses)
 
 
 class Tensor(NamedTuple):
@@ -96,7 +96,7 @@ def same_table(a: Tensor, b: Tensor) -> bool:
     other = b.entries
     if not (isinstance(one, Table) and isinstance(other, Table)):
         return False
-    return one.memory is other.memory and np.array_equal(one.places, other.places)
+    return one.memory is other.memory and np.array_equal(one.addresses, other.addresses)
 
 
 def scalar(entry: Any) -> Tensor:

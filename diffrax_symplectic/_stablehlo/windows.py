@@ -6,7 +6,8 @@ by comparing the index with every place that it may have. Arrays in memory are r
 the index says.
 
 Here a *start* is the index at which a window begins along one axis, and *places* are
-positions in the list of the entries of an array.
+positions in the list of the entries of an array. The *addresses* of an array in memory are
+the positions of its entries there.
 """
 
 import functools as ft
@@ -159,38 +160,40 @@ def _window_of_table(
     """As `_window_at`, where the entries of `x` are those of the `table` in memory. Each
     path reads its own window."""
     # `x` may be a part of what is in memory, or its transpose.
-    places = table.places.reshape(x.shape)
-    strides = _strides(operation, places)
-    signed = array_types()["i32"]
-    # The place of the window's first entry: that of the first entry of `x`, and a stride
+    addresses = table.addresses.reshape(x.shape)
+    strides = _strides(operation, addresses)
+    int32 = array_types()["i32"]
+    # The address of the window's first entry: that of the first entry of `x`, and a stride
     # for each index.
-    corner = signed(int(places.flat[0]))
+    first_address = int32(int(addresses.flat[0]))
     for start, stride, length, size in zip(starts, strides, x.shape, sizes):
         index = start.item()
         dtype = type(index)
         # The index is moved into `x` in its own type: made signed, a large one would be
         # negative.
         in_range = elementwise()["clamp"](dtype(0), index, dtype(length - size))
-        corner = corner + signed(in_range) * stride
+        first_address = first_address + int32(in_range) * stride
     offsets = np.broadcast_to(_offsets(strides, sizes), sizes)
-    unsigned = array_types()["ui32"]
+    uint32 = array_types()["ui32"]
     entries = [
-        table.gathered(unsigned(corner + int(offset))) for offset in offsets.flat
+        table.gathered(uint32(first_address + int(offset))) for offset in offsets.flat
     ]
     return Tensor(entries, tuple(sizes))
 
 
-def _strides(operation: Operation, places: np.ndarray) -> list[int]:
-    """For each axis of an array in memory, the distance between neighbours along it, from
-    the places of the entries. Raises a `NotReplayed` if distances differ along an axis."""
-    first = int(places.flat[0])
+def _strides(operation: Operation, addresses: np.ndarray) -> list[int]:
+    """For each axis of an array in memory, the distance between neighbours along it,
+    from the addresses of the entries. Raises a `NotReplayed` if distances differ along an axis."""
+    first = int(addresses.flat[0])
     strides = [
-        int(places.take(1, axis).flat[0]) - first if size > 1 else 0
-        for axis, size in enumerate(places.shape)
+        int(addresses.take(1, axis).flat[0]) - first if size > 1 else 0
+        for axis, size in enumerate(addresses.shape)
     ]
     # Entries that were moved in another way than by slices and transposes have no strides.
-    expected = np.broadcast_to(first + _offsets(strides, places.shape), places.shape)
-    if not np.array_equal(expected, places):
+    expected = np.broadcast_to(
+        first + _offsets(strides, addresses.shape), addresses.shape
+    )
+    if not np.array_equal(expected, addresses):
         what = (
             f"`{operation.full_name}` with an index per path, from an array in another "
             "order"

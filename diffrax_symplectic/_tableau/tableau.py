@@ -381,11 +381,11 @@ class PartitionedTableau(AbstractTableau):
         )
 
     def flatten(self) -> FlatTableau:
-        velocities = len(self.alpha_hat)
-        noise_stages = len(self.A1)
+        num_velocities = len(self.alpha_hat)
+        num_noise_stages = len(self.A1)
         variables = _variables(self.B0, self.beta)
-        B0 = _side_by_side(self.B0, variables, (velocities, noise_stages))
-        beta = _side_by_side(self.beta, variables, (noise_stages,))
+        B0 = _side_by_side(self.B0, variables, (num_velocities, num_noise_stages))
+        beta = _side_by_side(self.beta, variables, (num_noise_stages,))
         # Each random variable has noise stages of its own, all at the same points: the
         # velocities enter those of each variable in the same way.
         A1 = np.concatenate([self.A1] * len(variables))
@@ -397,7 +397,7 @@ class PartitionedTableau(AbstractTableau):
         ]
         # Velocities do not depend on time. All have the same time, so that a plan can merge
         # velocities at equal momenta.
-        velocity_stages = [Stage(("h",), 0.0, "p", "q") for _ in range(velocities)]
+        velocity_stages = [Stage(("h",), 0.0, "p", "q") for _ in range(num_velocities)]
         all_noise_stages = [
             Stage((variable,), float(c1), "q", "p")
             for variable in variables
@@ -408,7 +408,7 @@ class PartitionedTableau(AbstractTableau):
         # velocities are evaluated, depend on forces and noise; positions on velocities.
         matrix = np.zeros((len(stages), len(stages)))
         of_forces = slice(0, len(force_stages))
-        of_velocities = slice(of_forces.stop, of_forces.stop + velocities)
+        of_velocities = slice(of_forces.stop, of_forces.stop + num_velocities)
         of_noise = slice(of_velocities.stop, len(stages))
         matrix[of_forces, of_velocities] = self.A_hat
         matrix[of_velocities, of_forces] = self.A

@@ -112,7 +112,7 @@ def _cautions_on_samples(estimate: Expectation) -> Iterator[str]:
     dtype = _dtype_of_underflow(estimate)
     if dtype is not None:
         yield (
-            f"A component is zero, or underflows {dtype}, on all paths. If it "
+            f"An output of `phi` is zero, or underflows {dtype}, on all paths. If it "
             'underflows, use other units, or call `jax.config.update("jax_enable'
             '_x64", True)` first. If it is the indicator of a rare event, the event did '
             "not occur, and the standard error is meaningless. The gradient of an "
@@ -158,10 +158,11 @@ def _dtype_of_underflow(estimate: Expectation) -> str | None:
     """The dtype of an array of `phi` that is zero or underflows on all paths, if there is
     one."""
     moments = total(estimate.moments)
-    sizes = jtu.tree_leaves(moments.size.without_control)
+    # Without the control variate, which is not zero where `phi` is.
+    largest_values = jtu.tree_leaves(moments.size.without_control)
     dtypes = jtu.tree_leaves(moments.dtypes)
-    for size, dtype in zip(sizes, dtypes):
-        if np.max(size[Combination.BEST]) < _smallest_accurate(dtype):
+    for largest_value, dtype in zip(largest_values, dtypes):
+        if np.max(largest_value[Combination.BEST]) < _smallest_accurate(dtype):
             return dtype
     return None
 

@@ -174,22 +174,30 @@ class Surface(NamedTuple):
         # also of long sums, and any mistake of the user's.
         eps = float(jnp.finfo(p.dtype).eps)
         bound = eps ** (2 / 3)
-        # A constraint rounds as its positions do, or, where these are near the origin, as
-        # numbers of the size of its radius of curvature do: to show that radius, gradients
-        # are differentiated along a direction that no symmetry singles out.
         q = normal_space.q
-        direction = jnp.cos(1.0 + jnp.arange(len(q), dtype=p.dtype))
-        _, changes = jax.jvp(jax.jacrev(self.residual), (q,), (direction,))
-        # (constraints, positions), summed over the positions.
-        curvature = jnp.sum(jnp.abs(changes), axis=1)
-        squares = jnp.sum(normal_space.normals**2, axis=1)
-        # The gradient times the radius of curvature.
-        by_radius = squares / jnp.where(curvature > 0, curvature, jnp.inf)
-        size = jnp.maximum(_rounding(normal_space, q) / eps, by_radius)
+        size = jnp.maximum(
+            _rounding(normal_space, q) / eps, self._size_by_curvature(normal_space)
+        )
         position_is_on = jnp.all(jnp.abs(self.residual(q)) <= bound * size)
         normal_part = p - self.tangent(p, normal_space)
         momentum_is_tangent = max_norm(normal_part) <= bound * max_norm(p)
         return ~(position_is_on & momentum_is_tangent)
+
+    def _size_by_curvature(self, normal_space: NormalSpace) -> Multipliers:
+        """The size of the numbers of which each constraint is a difference, by its
+        curvature: its gradient times its radius of curvature.
+
+        A constraint rounds as its positions do, or, where these are near the origin, as
+        numbers of the size of that radius do.
+        """
+        q = normal_space.q
+        # Gradients are differentiated along a direction that no symmetry singles out.
+        direction = jnp.cos(1.0 + jnp.arange(len(q), dtype=q.dtype))
+        _, changes = jax.jvp(jax.jacrev(self.residual), (q,), (direction,))
+        # Of shape (constraints, positions), summed over the positions.
+        gradient_changes = jnp.sum(jnp.abs(changes), axis=1)
+        squares = jnp.sum(normal_space.normals**2, axis=1)
+        return squares / jnp.where(gradient_changes > 0, gradient_changes, jnp.inf)
 
 
 def _rounding(normal_space: NormalSpace, q: Vector) -> Multipliers:

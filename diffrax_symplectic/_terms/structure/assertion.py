@@ -68,25 +68,25 @@ def _breaks_structure(
     With the change (dp, dq) of the state by the term, the structures forbid:
 
     - additive: derivatives of dp and dq by p and q;
-    - separable, of a noise: dq itself, and derivatives of dp by p;
+    - separable, of a noise: dq itself with all its derivatives, and derivatives of dp by p;
     - separable, of a drift: derivatives of dp by p, and of dq by q and t.
     """
     zeros, unravel = zeros_and_unravel((y0, control_struct(term, t0)))
     # A bound between rounding errors, also of long sums, and any real mistake. Times may
     # have more digits than the state, so the dtype of the state decides.
     eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).eps)
-    rounding = eps ** (2 / 3)
+    threshold = eps ** (2 / 3)
 
     largest = largest_entry(y0)
     distance = _RELATIVE_DISTANCE * jnp.where(largest > 0, largest, 1)
 
     def is_broken_along(direction: Array) -> Bool[Array, ""]:
-        along, control = unravel(direction)
-        nearby = jtu.tree_map(lambda x, dx: x + distance * dx, y0, along)
-        return is_broken_at(y0, along, control) | is_broken_at(nearby, along, control)
+        dy, control = unravel(direction)
+        nearby = jtu.tree_map(lambda x, dx: x + distance * dx, y0, dy)
+        return is_broken_at(y0, dy, control) | is_broken_at(nearby, dy, control)
 
-    def is_broken_at(y: Y, along: Y, control: PyTree[Array]) -> Bool[Array, ""]:
-        along_p, along_q = along
+    def is_broken_at(y: Y, dy: Y, control: PyTree[Array]) -> Bool[Array, ""]:
+        along_p, along_q = dy
         zero = jtu.tree_map(jnp.zeros_like, along_p)
 
         def change_of_state(t: Array, y: Y) -> Y:
@@ -110,7 +110,7 @@ def _breaks_structure(
         of_p = [dp, dp_by_p, dp_by_q, dp_by_t]
         of_q = [dq, dq_by_p, dq_by_q, dq_by_t]
         # Values that are not finite compare as false: they tell nothing.
-        return largest_entry(forbidden) > rounding * largest_entry([of_p, of_q])
+        return largest_entry(forbidden) > threshold * largest_entry([of_p, of_q])
 
     directions = jr.normal(jr.key(0), (_NUM_DIRECTIONS, zeros.size), zeros.dtype)
     return jnp.any(jax.vmap(is_broken_along)(directions))
