@@ -172,10 +172,10 @@ def _window_of_table(
         # negative.
         in_range = elementwise()["clamp"](dtype(0), index, dtype(length - size))
         corner = corner + signed(in_range) * stride
-    offsets = np.broadcast_to(_offsets(strides, sizes), sizes)
     unsigned = array_types()["ui32"]
     entries = [
-        table.gathered(unsigned(corner + int(offset))) for offset in offsets.flat
+        table.gathered(unsigned(corner + int(offset)))
+        for offset in _offsets(strides, sizes).flat
     ]
     return Tensor(entries, tuple(sizes))
 
@@ -189,22 +189,22 @@ def _strides(operation: Operation, places: np.ndarray) -> list[int]:
         for axis, size in enumerate(places.shape)
     ]
     # Entries that were moved in another way than by slices and transposes have no strides.
-    expected = np.broadcast_to(first + _offsets(strides, places.shape), places.shape)
-    if not np.array_equal(expected, places):
+    if not np.array_equal(first + _offsets(strides, places.shape), places):
         what = (
-            f"`{operation.full_name}` with an index per path, from an array in another "
-            "order"
+            f"`{operation.full_name}` with an index per path, from an array whose entries "
+            "were moved other than by slices and transposes"
         )
         raise NotReplayed(operation.mlir_op, what)
     return strides
 
 
-def _offsets(strides: Sequence[int], shape: Sequence[int]) -> np.ndarray | int:
-    """How far in memory each entry is from the first, up to broadcasting: the number zero
-    for an array without axes, which has one entry."""
-    # `sparse` indices of an axis have length one along all others: their sum is broadcast.
+def _offsets(strides: Sequence[int], shape: Sequence[int]) -> np.ndarray:
+    """How far in memory each entry of an array of this shape is from the first."""
+    # `sparse` indices of an axis have length one along all others.
     indices = np.indices(shape, sparse=True)
-    return sum(stride * index for stride, index in zip(strides, indices))
+    total = sum(stride * index for stride, index in zip(strides, indices))
+    # Without axes the sum is the number zero.
+    return np.broadcast_to(total, shape)
 
 
 def _widened(index: Tensor) -> Tensor:

@@ -45,5 +45,5 @@ from .structure import constant_fault, Fault, FRICTION, noises_commute
 from .structure import separable_fault, truncated_in_unit
 from .structure import which_need_truncation, without_truncation
 from .symplectic_gradients import IndexedNoise, slow_apart
-from .vector_fields import apply, apply_one, check_fit, rate, tree_sum
+from .vector_fields import apply, apply_one, check_terms_fit_state, rate, tree_sum
 from .waves import from_pair, to_pair, wave_terms

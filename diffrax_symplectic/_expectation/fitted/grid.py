@@ -124,7 +124,7 @@ class Grid(AbstractBasis):
     along an axis. The correction falls to zero towards the edge of the grid; beyond it only
     the polynomial remains, whose degree is the one that fits best near the edge."""
 
-    kind: ClassVar[str] = "grid points along an axis"
+    candidate_name: ClassVar[str] = "grid points along an axis"
     d: int
     candidates: tuple[int]
 
@@ -145,8 +145,8 @@ class Grid(AbstractBasis):
         """The polynomials that the grid corrects."""
         return Hermite(self.d, _DEGREES)
 
-    def frame(self, states, good, unit):
-        inner = CovarianceFrame.of(states, good, unit)
+    def frame(self, states, good, scales):
+        inner = CovarianceFrame.of(states, good, scales)
         return StretchedFrame.of(
             inner, inner.coordinates(states), good, self._base.num_pilots
         )

@@ -208,7 +208,7 @@ class Noise(eqx.Module):
             end, _, _ = self.step(i, y, solver_state, x)
             return u(end)
 
-        first_derivatives = jax.jacrev(u_after)(0 * x)
+        first_derivatives = jax.jacrev(u_after)(jnp.zeros_like(x))
         # The second derivatives `C`, multiplied by this matrix and summed over both axes,
         # are `x^T C x - tr(C Sigma)`.
         centred_square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)

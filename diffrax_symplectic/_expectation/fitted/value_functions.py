@@ -302,7 +302,7 @@ def _reason(basis: AbstractBasis, choice: Choice) -> str:
     options = np.array([0, *basis.candidates])
     chosen = np.unique(options[np.where(choice.used, choice.best + 1, 0)])
     return (
-        f"{basis.kind}: {', '.join(map(str, chosen))}, chosen among "
+        f"{basis.candidate_name}: {', '.join(map(str, chosen))}, chosen among "
         f"{', '.join(map(str, np.unique(options)))}"
     )
 
