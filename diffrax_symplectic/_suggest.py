@@ -47,9 +47,9 @@ from ._terms import (
     FRICTION,
     friction_apart,
     has_unknown_law,
+    motion_numbers,
     noises_commute,
     number_of_noises,
-    path_numbers,
     random_paths,
     separable_fault,
     split_terms,
@@ -189,7 +189,7 @@ def suggest_solver(
     paths = brownian_paths(noise)
     solvers = _suitable(system, want, paths, one_term=len(noise) == 1)
 
-    numbers = path_numbers(random_paths(terms))
+    numbers = motion_numbers(random_paths(terms))
 
     # Solvers make paths without knowing what they drive, so some are truncated needlessly.
     needed = which_need_truncation(terms, t0, y0, args)

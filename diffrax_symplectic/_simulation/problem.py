@@ -31,7 +31,7 @@ from .._terms import (
     check_start,
     check_stratonovich,
     constraint_of,
-    path_numbers,
+    motion_numbers,
     step_variables,
     StepVariables,
     truncated_in_unit,
@@ -97,7 +97,7 @@ class Problem(eqx.Module):
     at_end: bool = eqx.field(static=True)
     # Which paths of the terms are one Brownian motion. Programs, whose keys are traced,
     # cannot tell.
-    path_numbers: tuple[int, ...] = eqx.field(static=True)
+    motion_numbers: tuple[int, ...] = eqx.field(static=True)
     # The number of steps on the finest level. (Shapes must be known when compiling.)
     finest_steps: int = eqx.field(static=True)
 
@@ -184,7 +184,7 @@ class Problem(eqx.Module):
             levels=all_levels,
             weights=weights,
             at_end=ts is None,
-            path_numbers=path_numbers(brownian_paths(terms)),
+            motion_numbers=motion_numbers(brownian_paths(terms)),
             finest_steps=int(all_levels.num_steps[-1]),
         )
 
@@ -256,7 +256,7 @@ class Problem(eqx.Module):
 
     def variables(self, h: Float[Array | np.ndarray, ""]) -> StepVariables:
         """The random variables of a step of this size."""
-        return step_variables(self.terms, h, self.path_numbers)
+        return step_variables(self.terms, h, self.motion_numbers)
 
     def values(self, t: Any, y: Y) -> Float[Array, " m"]:
         """All numbers of `phi` as one vector."""
