@@ -63,8 +63,8 @@ class CovarianceFrame(eqx.Module):
     def of(
         points: Float[Array, "n d"], good: Bool[Array, " n"], scales: Float[Array, " d"]
     ) -> "CovarianceFrame":
-        """The frame along the axes of the covariance of the good points. `scales` makes the
-        components comparable, and is zero for components that do not move."""
+        """The frame along the axes of the covariance of the good points. Divided by
+        `scales`, components are comparable; it is zero for components that do not move."""
         weights = equal_weights(good, points.dtype)
         mean = weights @ points
         inverse_scales = inverse_or_zero(scales)
@@ -96,7 +96,7 @@ def equal_weights(good: Bool[Array, " n"], dtype: Any) -> Float[Array, " n"]:
 
 
 def inverse_or_zero(scales: Float[Array, " d"]) -> Float[Array, " d"]:
-    """One over each number that is positive, and otherwise zero."""
+    """One over each scale that is positive, and otherwise zero."""
     is_positive = scales > 0
     # The inner `where` avoids a division by zero.
     return jnp.where(is_positive, 1 / jnp.where(is_positive, scales, 1), 0)
@@ -134,8 +134,8 @@ class AbstractBasis(eqx.Module):
         good: Bool[Array, " n"],
         scales: Float[Array, " d"],
     ) -> PyTree:
-        """The coordinates, from the pilot's states, its good paths, and the unit of each
-        component."""
+        """The coordinates, from the pilot's states, its good paths, and a length scale for
+        each component, which is zero for components that do not move."""
 
     @abc.abstractmethod
     def coefficients(
@@ -221,8 +221,8 @@ def _is_finite_row(x: Float[Array, "n ..."]) -> Bool[Array, " n"]:
 
 
 class CentredFrame(NamedTuple):
-    """Coordinates of `Quadratic`: states minus their `mean`, in these units, which are zero
-    for components that do not move."""
+    """Coordinates of `Quadratic`: states minus their `mean`, divided by these `scales`,
+    which are zero for components that do not move."""
 
     mean: Float[Array, " d"]
     scales: Float[Array, " d"]
@@ -258,7 +258,7 @@ class Quadratic(AbstractBasis):
 
     def coefficients(self, target, frame, states, good, keys):
         def derivatives(key_and_state):
-            """The first and second derivatives at a state, in units of the frame."""
+            """The first and second derivatives at a state, by its coordinates."""
             key, y = key_and_state
 
             def target_from_state(z):

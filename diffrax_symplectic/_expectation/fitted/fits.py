@@ -77,11 +77,11 @@ class FittedFunctions(eqx.Module):
 def fit(
     noise: Noise, key: PRNGKeyArray, basis: AbstractBasis
 ) -> tuple[FittedFunctions, Int[Array, ""]]:
-    """The functions of a level, by a pilot run forward in time and fits backward; and how
+    """The functions of a level, by a pilot run step_all in time and fits backward; and how
     many of the pilot's paths failed."""
     problem = noise.problem
     num_steps = noise.level.num_steps
-    pilot = _pilot(noise, jr.split(key, basis.num_pilots))
+    pilot = _run_pilot(noise, jr.split(key, basis.num_pilots))
     scales = _scales(problem, pilot, num_steps)
 
     def frame_after(i: Any) -> PyTree[Array]:
@@ -193,11 +193,11 @@ class _Pilot(NamedTuple):
     good: Bool[Array, " paths"]
 
 
-def _pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
+def _run_pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
     """Simulates a path for each key."""
     problem = noise.problem
 
-    def step(
+    def step_one(
         i: Any, y: Y, args: PyTree[Array], key: PRNGKeyArray
     ) -> tuple[Y, Bool[Array, ""]]:
         # With equal probabilities of all outcomes the pilot's paths spread further than
@@ -208,10 +208,10 @@ def _pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
         y, _, success = noise_of_path.step(i, y, solver_state, x)
         return y, success
 
-    def forward(i: Any, carry: tuple[PathStates, Array]) -> tuple[PathStates, Array]:
+    def step_all(i: Any, carry: tuple[PathStates, Array]) -> tuple[PathStates, Array]:
         paths, states = carry
-        step_of_all = jax.vmap(ft.partial(step, i))
-        y, success = step_of_all(paths.y, paths.args, keys)
+        vectorized_step = jax.vmap(ft.partial(step_one, i))
+        y, success = vectorized_step(paths.y, paths.args, keys)
         paths = paths.after_step(problem, y, None, success)
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
@@ -222,7 +222,7 @@ def _pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
     starts = jax.vmap(ravel)(paths.y)
     states = jnp.broadcast_to(starts, (problem.finest_steps, *starts.shape))
     carry = paths, states
-    paths, states = lax.fori_loop(0, noise.level.num_steps, forward, carry)
+    paths, states = lax.fori_loop(0, noise.level.num_steps, step_all, carry)
     return _Pilot(keys, starts, states, ~paths.failed)
 
 
