@@ -107,9 +107,8 @@ def solve(
 def solve_matrix(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
     """Solves `matrix @ x = rhs`, differentiably. If the matrix is singular, `x` is not
     finite, or large."""
-    # GMRES, too, solves to about rounding error here. The bound is a little above it, since
-    # GMRES itself is subject to rounding.
-    reduction = float(jnp.finfo(rhs.dtype).eps) ** 0.9
+    # GMRES, too, solves to rounding error here.
+    reduction = reduction_to_rounding(rhs.dtype)
 
     def multiply(x: _Vector) -> _Vector:
         return matrix @ x
@@ -127,6 +126,12 @@ def solve_matrix(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
     return lax.custom_linear_solve(
         multiply, rhs, ft.partial(solve_by, matrix), ft.partial(solve_by, matrix.T)
     )
+
+
+def reduction_to_rounding(dtype: Any) -> float:
+    """The reduction of the residual by which GMRES solves to about rounding error. It
+    cannot be as small as the rounding errors of one product with the matrix."""
+    return float(jnp.finfo(dtype).eps) ** 0.9
 
 
 def _unit_vectors(x: _Vector) -> Any:
