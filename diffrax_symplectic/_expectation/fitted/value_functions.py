@@ -42,6 +42,8 @@ from .tails import largest_tails, laws_of_trials, TrialLaw, UsualDeviations
 # Folded into the key of a call to draw trials. (Numbers of levels, which are folded into it
 # to draw fits, are smaller.)
 _TRIAL_KEY = 0xFFFFFFFE
+# From the code that calls `expectation` to `prepare`, counted as for `warnings.warn`.
+_FRAMES_TO_USER = 5
 # A trial of the tails has this many batches, more than the trial of one batch beyond whose
 # deviations it looks.
 _BATCHES_OF_TAIL_TRIAL = 2
@@ -92,7 +94,7 @@ class ValueFunctions(AbstractSampling):
 
     def prepare(self, problem, key, devices):
         chosen = chosen_basis(problem, self.degree)
-        warn_of_long_fit(chosen, stacklevel=5)
+        warn_of_long_fit(chosen, stacklevel=_FRAMES_TO_USER)
         basis = chosen.basis
         struct = problem.sample_struct
         controlled = _ControlledSampling(
@@ -116,7 +118,7 @@ class ValueFunctions(AbstractSampling):
             warnings.warn(
                 f"`degree={self.degree}` is no better than no control variate, so none is "
                 "used. Pass another `degree`, or another `sampling`.",
-                stacklevel=5,
+                stacklevel=_FRAMES_TO_USER,
             )
         # Trials with stronger noise estimate the deviations beyond the largest in these.
         usual_deviations = _usual_deviations(
