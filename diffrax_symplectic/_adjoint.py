@@ -334,7 +334,9 @@ def _solve_bwd(
             y_found, checkpoints, i, steps_between, walk.agrees, size
         )
         cotangents = _StepCotangents(
-            a_y1=walk.a_y, a_y0=(0 * walk.a_y**ω).ω, num_saved=walk.num_saved
+            a_y1=walk.a_y,
+            a_y0=jtu.tree_map(jnp.zeros_like, walk.a_y),
+            num_saved=walk.num_saved,
         )
         if ts is not None:
             t0 = times.time(i)
@@ -344,11 +346,11 @@ def _solve_bwd(
         # transposed Jacobian is exact.
         forward = ft.partial(step, i=i, back=False)
         _, vjp = jax.vjp(forward, y, diff)
-        a_y_through_step, a_parameters = vjp(cotangents.a_y1)
+        a_y_through_step, a_parameters_of_step = vjp(cotangents.a_y1)
         return _Walk(
             i=i,
             y=y,
-            a_parameters=(walk.a_parameters**ω + a_parameters**ω).ω,
+            a_parameters=(walk.a_parameters**ω + a_parameters_of_step**ω).ω,
             a_y=(cotangents.a_y0**ω + a_y_through_step**ω).ω,
             num_saved=cotangents.num_saved,
             size=size,
@@ -359,7 +361,7 @@ def _solve_bwd(
         a_y1 = jtu.tree_map(lambda a: a[-1], a_ys)
     else:
         # States saved at the end itself are met in the last step.
-        a_y1 = jtu.tree_map(lambda a: 0 * a[0], a_ys)
+        a_y1 = jtu.tree_map(lambda a: jnp.zeros_like(a[0]), a_ys)
     walk = _Walk(
         i=jnp.asarray(num_steps),
         y=y1,

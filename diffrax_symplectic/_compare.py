@@ -24,7 +24,7 @@ from ._solver import common_path, own_path
 from ._suggest import suggest_solver
 from ._terms import (
     check_stratonovich,
-    path_numbers,
+    motion_numbers,
     random_paths,
     shapes_as_paths,
     with_paths,
@@ -267,7 +267,7 @@ class _ComparedSystem(NamedTuple):
         compiled."""
         terms, t0, t1, y0, args, phi, *_ = self
         # Terms that share a path share a path again.
-        numbers = path_numbers(random_paths(terms))
+        numbers = motion_numbers(random_paths(terms))
 
         @eqx.filter_jit
         @lapack_in_turn

@@ -40,16 +40,16 @@ from ._terms import (
     check_assertions,
     check_baths_have_own_noise,
     check_drifts_differ,
-    check_fit,
+    check_terms_fit_state,
     constant_fault,
     constraint_of,
     Fault,
     FRICTION,
     friction_apart,
     has_unknown_law,
+    motion_numbers,
     noises_commute,
     number_of_noises,
-    path_numbers,
     random_paths,
     separable_fault,
     split_terms,
@@ -180,7 +180,7 @@ def suggest_solver(
     drift, noise = _drift_and_noise(terms)
     check_state(y0, "suggest_solver")
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
-    check_fit(terms, t0, y0, args)
+    check_terms_fit_state(terms, t0, y0, args)
     check_drifts_differ(terms)
     check_baths_have_own_noise(terms)
     check_assertions(terms, t0, y0, args)
@@ -189,7 +189,7 @@ def suggest_solver(
     paths = brownian_paths(noise)
     solvers = _suitable(system, want, paths, one_term=len(noise) == 1)
 
-    numbers = path_numbers(random_paths(terms))
+    numbers = motion_numbers(random_paths(terms))
 
     # Solvers make paths without knowing what they drive, so some are truncated needlessly.
     needed = which_need_truncation(terms, t0, y0, args)
@@ -461,10 +461,10 @@ def ranked(
         record = _record(solver)
         return want in record.suggested and record.noises in noises
 
-    all_solvers = [kind() for kind in SOLVERS]
+    all_solvers = [solver_class() for solver_class in SOLVERS]
     solvers = [solver for solver in all_solvers if solver.structure in structures]
     if friction:
-        solvers += [kind() for kind in LANGEVIN]
+        solvers += [solver_class() for solver_class in LANGEVIN]
     best_first = sorted(filter(is_suggested, solvers), key=rank)
     return [_BATH_OF_ANY_ENERGY, *best_first] if general_bath else best_first
 

@@ -169,11 +169,12 @@ def poisson_defect(
 
     jacobian, (s1, result) = jax.jacrev(step, has_aux=True)(s0)
     jacobian = result.error_if(jacobian, result != diffrax.RESULTS.successful)
-    # Row i of `gradients` is ds1_i / ds0, and row i of `units` the gradient of s_i itself.
+    # Row i of `gradients` is ds1_i / ds0, and row i of `unit_vectors` the gradient of s_i
+    # itself.
     num_components = s0.size
     gradients = jacobian.reshape(num_components, *s0.shape)
     identity = jnp.eye(num_components, dtype=s0.dtype)
-    units = identity.reshape(num_components, *s0.shape)
+    unit_vectors = identity.reshape(num_components, *s0.shape)
 
     def matrix(rows: Array) -> Array:
         return rows.reshape(num_components, num_components)
@@ -181,7 +182,7 @@ def poisson_defect(
     # P(s) is never formed: the cross products of s with the rows of a matrix are the
     # columns of P(s) times the transposed matrix. J P(s0) J^T, and then P(s1):
     J_P_Jt = _dot(matrix(gradients), matrix(jnp.cross(s0, gradients)).T)
-    P_s1 = matrix(jnp.cross(s1, units)).T
+    P_s1 = matrix(jnp.cross(s1, unit_vectors)).T
     return jnp.max(jnp.abs(J_P_Jt - P_s1))
 
 
@@ -286,11 +287,13 @@ def step_expectation(
     error when run if the solver reports a failed step.
     """
 
-    def outcome(terms_of_step: PyTree) -> tuple[PyTree[Array], diffrax.RESULTS]:
+    def value_after_step(
+        terms_of_step: PyTree,
+    ) -> tuple[PyTree[Array], diffrax.RESULTS]:
         y1, result = _one_step(terms_of_step, solver, t0, t1, y0, args)
         return fn(t1, y1, args), result
 
-    return _average(outcome, terms, t1 - t0, nodes)
+    return _mean_over_step(value_after_step, terms, t1 - t0, nodes)
 
 
 def second_moment_map(
@@ -330,7 +333,7 @@ def second_moment_map(
     # are the unit vectors.
     starts = jnp.eye(size + 1, size, k=-1, dtype=flat.dtype)
 
-    def outcome(terms_of_step: PyTree) -> tuple[Array, diffrax.RESULTS]:
+    def kron_Z_Z(terms_of_step: PyTree) -> tuple[Array, diffrax.RESULTS]:
         """The Kronecker product of Z with itself, for one outcome of the variables."""
 
         def step(y: Array) -> tuple[Array, diffrax.RESULTS]:
@@ -346,22 +349,27 @@ def second_moment_map(
         Z = jnp.concatenate([row_of_one, columns.T])
         return jnp.kron(Z, Z), result
 
-    return _average(outcome, terms, t1 - t0, nodes)
+    return _mean_over_step(kron_Z_Z, terms, t1 - t0, nodes)
 
 
-def _average(outcome: Callable, terms, h, nodes: int) -> PyTree[Array]:
-    """The expectation of a value after a step of size `h`. `outcome` gets the terms with
-    one outcome of the random variables of the step, and returns the value and the result
-    of the step. `nodes` is as for `step_expectation`."""
+def _mean_over_step(
+    value_of: Callable[[PyTree], tuple[PyTree[Array], diffrax.RESULTS]],
+    terms: PyTree[diffrax.AbstractTerm],
+    h: RealScalarLike,
+    nodes: int,
+) -> PyTree[Array]:
+    """The expectation of a value over the random variables of a step of size `h`.
+    `value_of` gets the terms with one outcome of these variables, and returns the value and
+    the result of the step. `nodes` is as for `step_expectation`."""
     check_baths_have_own_noise(terms)
     laws, terms_with = step_variables(terms, h)
-    variables, weights = outcomes(laws, nodes)
+    rows, weights = outcomes(laws, nodes)
 
-    def outcome_of(values_of_variables: Array) -> tuple[PyTree[Array], diffrax.RESULTS]:
-        return outcome(terms_with(values_of_variables))
+    def value_for(row: Array) -> tuple[PyTree[Array], diffrax.RESULTS]:
+        return value_of(terms_with(row))
 
-    # The step is traced once for all outcomes, which are the rows of `variables`.
-    values, result = jax.vmap(outcome_of)(variables)  # pyright: ignore
+    # Each row is an outcome of all variables. The step is traced once for all of them.
+    values, result = jax.vmap(value_for)(rows)  # pyright: ignore
     values = result.error_if(values, result != diffrax.RESULTS.successful)
 
     def mean(value: Array) -> Array:

@@ -15,7 +15,7 @@ from diffrax_symplectic._solver import LANGEVIN, own_path, SOLVERS
 from diffrax_symplectic._suggest import _shape_code, ranked
 from diffrax_symplectic._terms import (
     brownian_paths,
-    path_numbers,
+    motion_numbers,
     with_paths,
     with_paths_for_shapes,
 )
@@ -339,7 +339,7 @@ def test_terms_that_share_a_path_share_the_new_one():
     path = ds.WeakBrownianPath((), jr.key(0))
     equal = ds.WeakBrownianPath((), jr.key(0))
     other = ds.WeakBrownianPath((), jr.key(7))
-    shared = path_numbers([path, path, equal, other, path])
+    shared = motion_numbers([path, path, equal, other, path])
     assert shared == (0, 0, 0, 1, 0)
     for solver in (ds.ImplicitMidpoint(), ds.PlateauVerlet(), ds.LevyAreaMidpoint()):
         terms = _driven(path, path, equal, other)
@@ -364,7 +364,7 @@ def _call(fn, key):
 def test_traced_paths_are_one_brownian_motion_if_they_hold_the_same_key():
     def numbers(key, other):
         paths = [ds.WeakBrownianPath((), x) for x in (key, other, key)]
-        traced.append(path_numbers(paths))
+        traced.append(motion_numbers(paths))
         return key
 
     traced = []
@@ -374,7 +374,7 @@ def test_traced_paths_are_one_brownian_motion_if_they_hold_the_same_key():
 
 def test_each_shape_of_a_path_is_a_brownian_motion_of_its_own():
     shape = UnspecifiedPath(shape=jax.ShapeDtypeStruct((), jnp.float64))
-    assert path_numbers([shape, shape]) == (0, 1)
+    assert motion_numbers([shape, shape]) == (0, 1)
     for first in (shape, ds.WeakBrownianPath((), jr.key(0))):
         keys = _keys(
             with_paths_for_shapes(_driven(first, shape, shape), ds.WeakBrownianPath)

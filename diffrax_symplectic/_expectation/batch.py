@@ -65,14 +65,20 @@ def _moments_on_devices(
     low_high: UInt32[Array, "2"],
     num_wanted: Int[Array, ""],
     mesh: Mesh,
-    n: int,
+    samples_per_device: int,
 ) -> BatchMoments:
-    """The moments on all devices, along a leading axis. Each device takes `n` samples, and
-    the first device begins with the sample number whose low and high 32 bits are in
-    `low_high`. Only the first `num_wanted` samples of all devices together count."""
+    """The moments on all devices, along a leading axis. The first device begins with the
+    sample number whose low and high 32 bits are in `low_high`. Only the first `num_wanted`
+    samples of all devices together count."""
     if mesh.size == 1:
         moments = _moments_on_device(
-            sampler, key_data, key_impl, low_high, num_wanted, n, device=0
+            sampler,
+            key_data,
+            key_impl,
+            low_high,
+            num_wanted,
+            samples_per_device,
+            device=0,
         )
         return jtu.tree_map(lambda x: x[None], moments)
     dynamic, static = eqx.partition(sampler, eqx.is_array)
@@ -83,7 +89,13 @@ def _moments_on_devices(
         sampler = eqx.combine(dynamic, static)
         device = jax.lax.axis_index(_DEVICE_AXIS)
         moments = _moments_on_device(
-            sampler, key_data, key_impl, low_high, num_wanted, n, device
+            sampler,
+            key_data,
+            key_impl,
+            low_high,
+            num_wanted,
+            samples_per_device,
+            device,
         )
         return jtu.tree_map(lambda x: jax.lax.all_gather(x, _DEVICE_AXIS), moments)
 
@@ -117,13 +129,13 @@ def _moments_on_device(
     key_impl: Any,
     low_high: UInt32[Array, "2"],
     num_wanted: Int[Array, ""],
-    n: int,
+    samples_per_device: int,
     device: Any,
 ) -> BatchMoments:
-    """The moments on the device with this number, of its `n` samples. The other arguments
-    are those of `_moments_on_devices`."""
+    """The moments of the samples of the device with this number. The other arguments are
+    those of `_moments_on_devices`."""
     # The places of the samples among those of all devices.
-    index = device * n + jnp.arange(n)
+    index = device * samples_per_device + jnp.arange(samples_per_device)
     high, low = _sum_in_halves(low_high, index)
     key = jr.wrap_key_data(jnp.asarray(key_data), impl=key_impl)
 

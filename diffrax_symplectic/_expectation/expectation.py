@@ -22,7 +22,7 @@ from .._simulation import (
 from .._solver import own_path
 from .._terms import (
     brownian_paths,
-    path_numbers,
+    motion_numbers,
     random_paths,
     with_paths,
     without_truncation,
@@ -282,7 +282,7 @@ def _trial_with_gaussian_increments(
 ) -> Expectation:
     """An estimate of the same mean, with Gaussian increments in place of those of `terms`,
     for a solver that takes them. `key` is that of the call."""
-    numbers = path_numbers(random_paths(problem.terms))
+    numbers = motion_numbers(random_paths(problem.terms))
     gaussian_path = ft.partial(own_path, problem.solver, "strong")
     terms = with_paths(gaussian_path, numbers, problem.terms, key)
     gaussian_problem = dataclasses.replace(problem, terms=without_truncation(terms))

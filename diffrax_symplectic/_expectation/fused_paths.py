@@ -126,8 +126,8 @@ def _samples_of_fused_paths(
 
     # (levels, n, S, m)
     phi = jax.vmap(values_on_level)(problem.levels, paths.y)
-    finite = jax.vmap(jax.vmap(all_finite))(phi)
-    failed = jnp.asarray(paths.failed) | ~finite
+    is_finite = jax.vmap(jax.vmap(all_finite))(phi)
+    failed = jnp.asarray(paths.failed) | ~is_finite
     # (levels, S, n, m)
     phi = jnp.swapaxes(phi, 1, 2)
     return Samples(

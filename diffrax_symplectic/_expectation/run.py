@@ -61,16 +61,15 @@ def run(
     tol: float | None = None,
     meter: Meter | None = None,
 ) -> Expectation:
-    """The estimate from the samples of a plan, which continues `start`, or begins with
-    sample number `first`. The result does not depend on the number of devices."""
-    # The number of the first sample that is not in `start`.
-    next_sample = first
-    if start is not None:
-        first = start.moments[0].begin
-        next_sample = start.moments[-1].end
-    end = first + plan.num_samples
+    """The estimate from the samples of a plan, which continues `start`, or without it
+    begins with sample number `first`. With a tolerance `tol` it may end before all samples
+    of the plan. The result does not depend on the number of devices."""
+    # The first sample of all, and the first that is not in `start`.
+    begin = first if start is None else start.moments[0].begin
+    next_sample = first if start is None else start.moments[-1].end
+    end = begin + plan.num_samples
     batches = _Batches(plan, key, devices)
-    no_moments = batches.without_samples(next_sample, end)
+    no_moments = batches.moments_of_no_samples(next_sample, end)
     estimate = Expectation(
         moments=(no_moments,),
         key_data=batches.key_data,
@@ -85,7 +84,7 @@ def run(
         if next_sample > end:
             raise ValueError(
                 "The number of paths (or replicates) includes `start`, which has "
-                f"{next_sample - first} already; got {plan.num_samples}. Pass a larger "
+                f"{next_sample - begin} already; got {plan.num_samples}. Pass a larger "
                 "number."
             )
         estimate = dataclasses.replace(estimate, moments=start.moments)
@@ -95,27 +94,29 @@ def run(
 
     running_batches: collections.deque[BatchMoments] = collections.deque()
     # One past the last sample of the batches that were started.
-    started_end = next_sample
+    end_of_started = next_sample
     try:
         while True:
-            starts_batch = started_end < end and not needs_no_more_samples()
+            starts_batch = end_of_started < end and not needs_no_more_samples()
             if starts_batch:
-                sampler = batches.sampler_at(started_end)
-                running_batches.append(batches.start(started_end, end, sampler))
-                started_end += batches.size * len(devices)
+                sampler = batches.sampler_at(end_of_started)
+                running_batches.append(batches.start(end_of_started, end, sampler))
+                end_of_started += batches.size * len(devices)
             # While the batch just started is being computed, the one before is added up.
             has_previous = len(running_batches) > (1 if starts_batch else 0)
             if has_previous:
-                for of_device in batches.on_devices(running_batches.popleft()):
+                for device_moments in batches.moments_of_devices(
+                    running_batches.popleft()
+                ):
                     # The moments of each device are a batch of their own: where to stop
                     # does not depend on how many devices there are.
                     if _end_of(estimate) == end or needs_no_more_samples():
                         break
                     estimate = _with_batch(
-                        estimate, of_device, batches.size, end, no_moments.dtypes
+                        estimate, device_moments, batches.size, end, no_moments.dtypes
                     )
                 if meter is not None:
-                    share = (_end_of(estimate) - first) / plan.num_samples
+                    share = (_end_of(estimate) - begin) / plan.num_samples
                     meter.step(max(share, share_of_needed(estimate, tol)))
             elif not starts_batch:
                 break
@@ -133,7 +134,7 @@ def _end_of(estimate: Expectation) -> int:
 
 def _with_batch(
     estimate: Expectation,
-    of_device: BatchMoments,
+    device_moments: BatchMoments,
     batch_size: int,
     end: int,
     dtypes: PyTree[str],
@@ -142,7 +143,7 @@ def _with_batch(
     which was computed in these `dtypes`."""
     begin = _end_of(estimate)
     batch_end = min(begin + batch_size, end)
-    new_moments = _in_float64(of_device, begin, batch_end, dtypes)
+    new_moments = _in_float64(device_moments, begin, batch_end, dtypes)
     moments = combined_in_halves((*estimate.moments, new_moments))
     return dataclasses.replace(estimate, moments=moments)
 
@@ -199,7 +200,7 @@ class _Batches:
             self.size,
         )
 
-    def on_devices(self, running_batch: BatchMoments) -> list[BatchMoments]:
+    def moments_of_devices(self, running_batch: BatchMoments) -> list[BatchMoments]:
         """The moments on each device, copied to the host as soon as they are computed."""
         # The moments are traced if a function closes over traced values.
         check_untraced("`expectation` or `monte_carlo`", running_batch)
@@ -207,7 +208,7 @@ class _Batches:
         num_devices = len(self._devices)
         return [jtu.tree_map(lambda x, k=k: x[k], arrays) for k in range(num_devices)]
 
-    def without_samples(self, first: int, end: int) -> Moments:
+    def moments_of_no_samples(self, first: int, end: int) -> Moments:
         """The moments of no samples, which the batch from sample number `first` on
         continues."""
         struct = self._struct
@@ -242,17 +243,17 @@ def _samples_of_paths(
 
 
 def _in_float64(
-    of_device: BatchMoments, begin: int, end: int, dtypes: PyTree[str]
+    device_moments: BatchMoments, begin: int, end: int, dtypes: PyTree[str]
 ) -> Moments:
     """The moments of samples `begin` to `end - 1`, in float64."""
     # Single precision could not hold the sum of a mean and its correction.
-    wide = jtu.tree_map(lambda x: x.astype(float), of_device)
+    wide = jtu.tree_map(lambda x: x.astype(float), device_moments)
     return Moments(
         begin=begin,
         end=end,
-        num_good=int(of_device.num_good),
-        num_failed=int(of_device.num_failed),
-        failed_on=tuple(map(int, of_device.failed_on)),
+        num_good=int(device_moments.num_good),
+        num_failed=int(device_moments.num_failed),
+        failed_on=tuple(map(int, device_moments.failed_on)),
         mean=jtu.tree_map(np.add, wide.mean, wide.mean_correction),
         norm=wide.norm,
         largest=wide.largest,

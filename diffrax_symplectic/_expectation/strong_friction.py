@@ -153,8 +153,10 @@ def _change_along_step(problem: Problem, dt0: float) -> Float[Array, ""]:
             h = dt0 * 2.0**number
             increments = _normal_like(controls, jr.fold_in(key, number), jnp.sqrt(h))
             y = p, q0
-            kick, _ = apply(bath_noise, increments, problem.args, problem.t0, y)
-            return after_friction(friction, problem.t0, h, y, problem.args, kick)
+            noise_change, _ = apply(bath_noise, increments, problem.args, problem.t0, y)
+            return after_friction(
+                friction, problem.t0, h, y, problem.args, noise_change
+            )
 
         return lax.fori_loop(0, _DOUBLINGS, step_of_bath, p0)
 

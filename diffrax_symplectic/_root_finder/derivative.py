@@ -10,7 +10,7 @@ from jax import lax
 from jaxtyping import Array, Float, PyTree
 
 from .._batch import where_pending
-from .linear import LinearSolver, MAX_WRITTEN_OUT, solve
+from .linear import LinearSolver, MAX_WRITTEN_OUT, reduction_to_rounding, solve
 from .sweeps import solve_by_sweeps
 from .tolerance import Tolerance
 
@@ -74,9 +74,8 @@ def _solve(
         guess=jnp.zeros_like(rhs),
         pending=jnp.array(True),
     )
-    # No Newton correction makes up for the error of GMRES here, so it must be small, but it
-    # cannot be as small as the rounding errors of one product.
-    reduction = float(jnp.finfo(rhs.dtype).eps) ** 0.9
+    # No Newton correction makes up for the error of GMRES here, so it must be small.
+    reduction = reduction_to_rounding(rhs.dtype)
 
     def solve_straggler(_: Float[Array, " n"]) -> Float[Array, " n"]:
         return solve(operator, rhs, solver=None, reduction=reduction).value

@@ -70,7 +70,7 @@ def correction(fn: _Map, x: _Vector, solver: LinearSolver) -> NewtonCorrection:
     def value_and_column(unit: _Vector) -> tuple[_Vector, _Vector]:
         return jax.jvp(fn, (x,), (unit,))
 
-    value, matrix = jax.vmap(value_and_column, out_axes=(None, 1))(_units(x))
+    value, matrix = jax.vmap(value_and_column, out_axes=(None, 1))(_unit_vectors(x))
 
     def product(vector: _Vector) -> _Vector:
         # The sum is unrolled, so that XLA fuses it: it reduces short axes slowly on CPUs.
@@ -91,7 +91,7 @@ def solve(
     or for many unknowns GMRES with this `reduction` of the residual. Nothing is raised on
     failure."""
     if solver is None and rhs.size <= _MAX_DENSE:
-        matrix = jax.vmap(apply, out_axes=1)(_units(rhs))
+        matrix = jax.vmap(apply, out_axes=1)(_unit_vectors(rhs))
         # A singular matrix shows as entries that are not finite.
         return LinearSolution(eliminate(matrix, rhs), jnp.array(True))
     if solver is None:
@@ -108,14 +108,17 @@ def solve_matrix(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
     """Solves `matrix @ x = rhs`, differentiably. If the matrix is singular, `x` is not
     finite, or large."""
     # GMRES, too, solves to rounding error here.
-    reduction = float(jnp.finfo(rhs.dtype).eps) ** 0.9
+    reduction = reduction_to_rounding(rhs.dtype)
 
     def multiply(x: _Vector) -> _Vector:
         return matrix @ x
 
-    def solve_by(matrix: Float[Array, "n n"], apply: _Map, rhs: _Vector) -> _Vector:
-        if len(matrix) <= _MAX_DENSE:
-            return eliminate(matrix, rhs)
+    # JAX calls this with `multiply` or its transpose as `apply`.
+    def solve_by(
+        matrix_or_transpose: Float[Array, "n n"], apply: _Map, rhs: _Vector
+    ) -> _Vector:
+        if len(matrix_or_transpose) <= _MAX_DENSE:
+            return eliminate(matrix_or_transpose, rhs)
         return solve(apply, rhs, solver=None, reduction=reduction).value
 
     # Derivatives come from the equation: they are solves with the matrix, or in reverse
@@ -125,7 +128,13 @@ def solve_matrix(matrix: Float[Array, "n n"], rhs: _Vector) -> _Vector:
     )
 
 
-def _units(x: _Vector) -> Any:
+def reduction_to_rounding(dtype: Any) -> float:
+    """The reduction of the residual by which GMRES solves to about rounding error. It
+    cannot be as small as the rounding errors of one product with the matrix."""
+    return float(jnp.finfo(dtype).eps) ** 0.9
+
+
+def _unit_vectors(x: _Vector) -> Any:
     """The unit vectors, as rows."""
     # A NumPy constant, which XLA folds, unlike `jnp.eye`.
     return np.eye(x.size, dtype=x.dtype)

@@ -139,8 +139,8 @@ class Newton(eqx.Module):
         level = log2(size)
         rate = log2(shrinkage)
         is_at_rounding = shrinkage >= _SHRINK_AT_ROUNDING
-        is_solved = converged(
-            level, rate, correction_size.is_rounding, stalled=is_at_rounding
+        has_converged = converged(
+            level, rate, correction_size.is_rounding, has_stalled=is_at_rounding
         )
         # Far from any solution, rounding errors of a large Jacobian can hide the unknowns
         # with small coefficients. Corrections are then small, but residuals exceed the
@@ -149,7 +149,8 @@ class Newton(eqx.Module):
         allowed_residual = jnp.maximum(size_of_scale, size_of_iterate)
         allowed_residual = allowed_residual + self.tolerance.atol
         residual_fits = max_norm(newton.residual) <= allowed_residual
-        is_solved &= is_whole_step & newton.found & residual_fits & all_finite(next_k)
+        is_correct = newton.found & residual_fits & all_finite(next_k)
+        is_solved = has_converged & is_whole_step & is_correct
 
         # The whole step at once is tried first, from a guess that may be poor. The last
         # part of a continuation and the search begin near a solution, or fail soon.
@@ -158,12 +159,12 @@ class Newton(eqx.Module):
         # A zero correction away from a solution is no progress either.
         is_due = tries >= patience
         makes_progress = (shrinkage < _SHRINK) & (size > 0)
-        has_stalled = is_due & ~makes_progress
+        has_stopped = is_due & ~makes_progress
         is_slow = ~is_whole_step & (tries >= _PATIENCE_IN_PART)
         is_near = max_norm(newton.change) < _LOOSE * size_of_iterate
         part_is_solved = is_near & ~is_whole_step
-        has_failed = ~jnp.isfinite(size) | has_stalled | is_slow
-        has_failed = has_failed & ~part_is_solved & ~is_solved
+        cannot_go_on = ~jnp.isfinite(size) | has_stopped | is_slow
+        has_failed = cannot_go_on & ~part_is_solved & ~is_solved
         progress = progress._replace(tries=tries, size=size, is_solved=is_solved)
         # A search goes on from where it is: there is no shorter part to go back to.
         return _next_target(

@@ -25,7 +25,7 @@ _UNSOLVED = optx.RESULTS.nonlinear_divergence
 class _FinderState(NamedTuple):
     """The state of the root finder, between its only step and the end.
 
-    - `is_solved`: whether the equations are solved.
+    - `is_solved`: whether the equations are solved, or had no finite guess.
     - `result`: success, or the reason why they are not.
     - `aux`: the structure of the auxiliary output.
     """
@@ -120,15 +120,18 @@ class PicardNewton(
         del tags
         scale = options.get("scale", _unknowns_themselves)
         # A guess that is not finite stands for a path that failed before. It is left alone,
-        # so that the others of its batch need not wait for it.
-        pending = all_finite(y)
+        # so that the others of its batch need not wait for it, and counts as solved: the
+        # path stays not finite, which its caller sees.
+        can_solve = all_finite(y)
         solve = ft.partial(solve_by_sweeps, self._tolerance, self.picard_steps)
         if "solve_blocks" in options:
-            by_sweeps, is_solved = options["solve_blocks"](args, solve, y, pending)
+            solve_blocks = options["solve_blocks"]
+            by_sweeps, solved_by_sweeps = solve_blocks(args, solve, y, can_solve)
         else:
-            by_sweeps, is_solved = solve(_image(fn, args), scale, y, pending)
+            image = _image(fn, args)
+            by_sweeps, solved_by_sweeps = solve(image, scale, y, can_solve)
         # Newton's method is for the paths that sweeps did not solve.
-        pending = pending & ~is_solved
+        pending = can_solve & ~solved_by_sweeps
         if self.newton_steps == 0:
             # Without Newton's method a program compiles in half the time.
             y_new = by_sweeps

@@ -57,7 +57,8 @@ class _SweepState(NamedTuple):
     - `y`: the iterate.
     - `relaxation`: the relaxation factor.
     - `level`: the base-2 logarithm of the size of the last correction.
-    - `is_solved`: whether it was small enough.
+    - `is_solved`: whether the last correction of the path, while it was pending, was small
+        enough.
     - `pending`: whether to continue.
     - `num_done`: the number of sweeps so far, shared by all paths of the batch.
     - `num_ahead`: the number of sweeps until the next check, shared by them; zero at the
@@ -226,22 +227,22 @@ def _decide(
     # The rate is a base-2 logarithm, so that the number of further sweeps is a quotient.
     rate = (level - last_level) / state.num_ahead
     num_done = state.num_done + state.num_ahead
-    stalled = rate >= STALLED
-    is_solved = converged(level, rate, correction.is_rounding, stalled)
+    has_stalled = rate >= STALLED
+    has_converged = converged(level, rate, correction.is_rounding, has_stalled)
     # Sweeps that diverged get one more try. If it stalls, Newton's method takes over.
-    starts_again = stalled & (state.relaxation > _STRONGEST_RELAXATION)
+    starts_again = has_stalled & (state.relaxation > _STRONGEST_RELAXATION)
     ratio = jnp.exp2(rate)
     # The relaxation is tuned once, at the first check: later rates are those of relaxed
     # sweeps, to which the formula does not apply.
-    is_tuned_now = (state.num_done == 0) & (ratio > SLOW) & ~stalled
+    is_tuned_now = (state.num_done == 0) & (ratio > SLOW) & ~has_stalled
     # After so many sweeps the level is at `-MARGIN`.
     num_needed = (level + MARGIN) / jnp.where(is_tuned_now, -_RELAXED_RATE, -rate)
     # Sweeps that would not end in time end now, before they cost anything.
-    in_time = starts_again | (~stalled & (num_done + num_needed < max_sweeps))
-    pending = state.pending & ~is_solved & in_time & (num_done < max_sweeps)
+    in_time = starts_again | (~has_stalled & (num_done + num_needed < max_sweeps))
+    pending = state.pending & ~has_converged & in_time & (num_done < max_sweeps)
     # Newton's method begins where the sweeps ended if that is near a solution, or else at
     # the guess.
-    is_near = ~stalled & (correction.is_small | pending)
+    is_near = ~has_stalled & (correction.is_small | pending)
     num_ahead = jnp.where(starts_again, first_sweeps, num_needed)
     # Corrections as small as rounding errors show no rate.
     num_ahead = jnp.where(
@@ -253,13 +254,13 @@ def _decide(
         y=None,
         relaxation=jnp.where(starts_again, _STRONGEST_RELAXATION, relaxation),
         level=jnp.where(starts_again, jnp.inf, level),
-        is_solved=jnp.where(state.pending, is_solved, state.is_solved),
+        is_solved=jnp.where(state.pending, has_converged, state.is_solved),
         pending=pending,
         num_done=num_done,
         # The path of the batch that needs the most sweeps decides for all.
         num_ahead=jnp.minimum(most_of_batch(num_ahead), _MOST_BETWEEN_CHECKS),
     )
-    return _Decision(next_state, goes_back=~(is_near | is_solved))
+    return _Decision(next_state, goes_back=~(is_near | has_converged))
 
 
 def best_relaxation(rate: Scalar) -> Scalar:

@@ -144,12 +144,14 @@ def log2(x: Scalar) -> Scalar:
     return bits * 2.0**-info.nmant + float(info.minexp - 1)
 
 
-def converged(level: Scalar, rate: Scalar, is_rounding: _Flag, stalled: _Flag) -> _Flag:
+def converged(
+    level: Scalar, rate: Scalar, is_rounding: _Flag, has_stalled: _Flag
+) -> _Flag:
     """Whether the next correction will be below the tolerance by `MARGIN`; or corrections
-    no longer shrink (`stalled`) and are as small as rounding errors (`is_rounding`).
+    no longer shrink (`has_stalled`) and are as small as rounding errors (`is_rounding`).
     `level` and `rate` are the base-2 logarithms of the last correction, in units of the
     tolerance, and of its ratio to the previous one."""
     # With linear convergence the next correction is smaller by the same ratio. A correction
     # that grew says nothing about the next one, so that it must be small itself.
     next_level = level + jnp.minimum(rate, 0)
-    return (next_level <= -MARGIN) | (stalled & is_rounding)
+    return (next_level <= -MARGIN) | (has_stalled & is_rounding)

@@ -32,7 +32,7 @@ from .._terms import (
     call_user_function,
     check_baths_have_own_noise,
     check_drifts_differ,
-    check_fit,
+    check_terms_fit_state,
     has_lifted,
 )
 
@@ -240,7 +240,7 @@ def check_shapes(
 ) -> None:
     """Raises an error unless the terms fit the state, and `phi` takes this state and
     returns real arrays."""
-    check_fit(terms, t0, y0, args)
+    check_terms_fit_state(terms, t0, y0, args)
     check_takes("phi", phi, "t", "y", "args")
     result = _result_struct(phi, terms, t0, y0, args)
     check_real("phi", jtu.tree_leaves(result))

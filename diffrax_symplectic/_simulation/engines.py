@@ -179,8 +179,12 @@ def _fused_batch(
 
 
 class FusedStart(NamedTuple):
-    """The paths of a batch before their first step, and the kernels that take their steps:
-    `kernels.advance(lanes, shared, first_step, end_step)`.
+    """The paths of a batch before their first step.
+
+    - `kernels`: what takes their steps, by
+        `kernels.advance(lanes, shared, first_step, end_step)`.
+    - `lanes`: what differs between paths.
+    - `shared`: what all paths share.
     """
 
     kernels: Kernels
@@ -262,8 +266,8 @@ def _with_stragglers(
     num_stragglers = len(stragglers)
     # Their number is rounded up to a power of four, by repeating stragglers, so that JAX
     # compiles few programs.
-    power = int(np.ceil(np.log(num_stragglers) / np.log(4)))
-    num_to_solve = min(len(sample_numbers), 4**power)
+    power_of_four = 4 ** int(np.ceil(np.log(num_stragglers) / np.log(4)))
+    num_to_solve = min(len(sample_numbers), power_of_four)
     repeated_stragglers = np.resize(stragglers, num_to_solve)
     solved = by_jax(problem, key, sample_numbers[repeated_stragglers], level)
 

@@ -31,7 +31,7 @@ from .._terms import (
     check_start,
     check_stratonovich,
     constraint_of,
-    path_numbers,
+    motion_numbers,
     step_variables,
     StepVariables,
     truncated_in_unit,
@@ -97,7 +97,7 @@ class Problem(eqx.Module):
     at_end: bool = eqx.field(static=True)
     # Which paths of the terms are one Brownian motion. Programs, whose keys are traced,
     # cannot tell.
-    path_numbers: tuple[int, ...] = eqx.field(static=True)
+    motion_numbers: tuple[int, ...] = eqx.field(static=True)
     # The number of steps on the finest level. (Shapes must be known when compiling.)
     finest_steps: int = eqx.field(static=True)
 
@@ -154,12 +154,13 @@ class Problem(eqx.Module):
             check_start(terms, t0_of_dtype, y0, args)
         check_noise(terms)
         if any(is_made_by_solver):
-            is_needed = which_need_truncation(terms, t0_of_dtype, y0, args)
-            terms = _without_needless_truncation(terms, is_made_by_solver, is_needed)
+            needs_truncation = which_need_truncation(terms, t0_of_dtype, y0, args)
             # All levels have the same unit. An array: another one compiles nothing anew.
             unit = _UNIT_OF_TRUNCATION * (float(t1) - float(t0))
             unit = np.asarray(unit, t0_of_dtype.dtype)
-            terms = truncated_in_unit(terms, is_made_by_solver, unit)
+            terms = _truncated_where_needed(
+                terms, is_made_by_solver, needs_truncation, unit
+            )
         check_truncation(terms, float(dt0))
         smallest_step = float(dt0) / 2 ** (levels - 1)
         if isinstance(solver, AbstractSymplecticSolver):
@@ -184,7 +185,7 @@ class Problem(eqx.Module):
             levels=all_levels,
             weights=weights,
             at_end=ts is None,
-            path_numbers=path_numbers(brownian_paths(terms)),
+            motion_numbers=motion_numbers(brownian_paths(terms)),
             finest_steps=int(all_levels.num_steps[-1]),
         )
 
@@ -256,7 +257,7 @@ class Problem(eqx.Module):
 
     def variables(self, h: Float[Array | np.ndarray, ""]) -> StepVariables:
         """The random variables of a step of this size."""
-        return step_variables(self.terms, h, self.path_numbers)
+        return step_variables(self.terms, h, self.motion_numbers)
 
     def values(self, t: Any, y: Y) -> Float[Array, " m"]:
         """All numbers of `phi` as one vector."""
@@ -327,27 +328,30 @@ class Problem(eqx.Module):
         return self.levels.saved_steps.shape[1], m
 
 
-def _without_needless_truncation(
+def _truncated_where_needed(
     terms: PyTree[diffrax.AbstractTerm],
     is_made_by_solver: Sequence[bool],
-    is_needed: Sequence[bool],
+    needs_truncation: Sequence[bool],
+    unit: np.ndarray,
 ) -> PyTree[diffrax.AbstractTerm]:
-    """The terms without truncation in those paths that a solver makes and that need none. A
-    solver makes a path without knowing what it drives, and truncates its increments to be
-    safe. Paths of the user are kept as they are."""
-    is_needless = [
-        is_made and not needs_truncation
-        for is_made, needs_truncation in zip(is_made_by_solver, is_needed)
+    """The terms with truncation, in this unit of time, in those paths that a solver makes
+    and that need it, and without in those that do not. A solver makes a path without
+    knowing what it drives, and truncates its increments to be safe. Paths of the user are
+    kept as they are."""
+    is_truncated_needlessly = [
+        is_made and not needs
+        for is_made, needs in zip(is_made_by_solver, needs_truncation)
     ]
-    return without_truncation(terms, is_needless)
+    terms = without_truncation(terms, is_truncated_needlessly)
+    return truncated_in_unit(terms, is_made_by_solver, unit)
 
 
-def advice_on_failures(bounded: bool) -> str:
-    """What to do about failed paths, in a sentence for messages. `bounded` is whether the
-    increments of all paths are known to be bounded."""
-    alternative = " or bounded increments, as from a `WeakBrownianPath`,"
-    if bounded:
-        alternative = ""
+def advice_on_failures(has_bounded_increments: bool) -> str:
+    """What to do about failed paths, in a sentence for messages. The argument is whether
+    the increments of all paths are known to be bounded."""
+    alternative = ""
+    if not has_bounded_increments:
+        alternative = " or bounded increments, as from a `WeakBrownianPath`,"
     return (
         f"Take smaller steps{alternative} and look for NaNs in `y0`, `args` and the "
         "Hamiltonians, and for a `temperature` or `friction` that is negative or, as a "

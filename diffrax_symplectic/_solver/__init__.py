@@ -38,18 +38,23 @@ from .times import check_resolution
 # All solvers, in the order of the imports above, which is that of the documentation.
 # Abstract classes have no record.
 _ALL = [
-    kind
-    for kind in tuple(globals().values())
-    if isinstance(kind, type) and issubclass(kind, AbstractSymplecticSolver)
-    if kind.record is not None
+    solver_class
+    for solver_class in tuple(globals().values())
+    if isinstance(solver_class, type)
+    and issubclass(solver_class, AbstractSymplecticSolver)
+    if solver_class.record is not None
 ]
 # Those that need friction, from `langevin_terms`.
 LANGEVIN: tuple[type[AbstractLangevinSplitting], ...] = tuple(
-    kind for kind in _ALL if issubclass(kind, AbstractLangevinSplitting)
+    solver_class
+    for solver_class in _ALL
+    if issubclass(solver_class, AbstractLangevinSplitting)
 )
 # All others that do not wrap another solver.
 SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = tuple(
-    kind
-    for kind in _ALL
-    if not issubclass(kind, AbstractLangevinSplitting | diffrax.AbstractWrappedSolver)
+    solver_class
+    for solver_class in _ALL
+    if not issubclass(
+        solver_class, AbstractLangevinSplitting | diffrax.AbstractWrappedSolver
+    )
 )

@@ -99,9 +99,9 @@ def after_friction(
     h: RealScalarLike,
     y: tuple[PyTree[Array], PyTree[Array]],
     args: Args,
-    kick: PyTree[Array] | None = None,
+    impulse: PyTree[Array] | None = None,
 ) -> PyTree[Array]:
-    r"""The momenta after friction and noise over `h`, with the `kick` $B W$ of the noise:
+    r"""The momenta after friction and noise over `h`, with the impulse $B W$ of the noise:
     $p + x$ with $x = h F(p + x / 2) + B W$, where $F(p) = -G v(p)$ is linear in $p$.
 
     This keeps the Maxwell distribution $\mathcal N(0, T M)$ for all $h$, $M$ and $G = B
@@ -114,21 +114,21 @@ def after_friction(
         friction_force, _ = rate(friction, t, (p, q), args)
         return friction_force
 
-    if kick is None:
-        kick = jtu.tree_map(jnp.zeros_like, p)
+    if impulse is None:
+        impulse = jtu.tree_map(jnp.zeros_like, p)
     # F(p + x / 2) = F(p) + S x / 2 with the slope S of F, so that
     # (1 - h S / 2) x = h F(p) + B W.
     if acts_elementwise(force, p):
-        return _after_own_friction(force, h, p, kick)
+        return _after_own_friction(force, h, p, impulse)
     flat_p, unravel = jfu.ravel_pytree(p)
-    flat_kick, _ = jfu.ravel_pytree(kick)
+    flat_impulse, _ = jfu.ravel_pytree(impulse)
 
     def flat_force(flat_p: Array) -> Array:
         return jfu.ravel_pytree(force(unravel(flat_p)))[0]
 
     step_size = jnp.asarray(h, flat_p.dtype)
     slope = jax.jacfwd(flat_force)(flat_p)
-    rhs = step_size * flat_force(flat_p) + flat_kick
+    rhs = step_size * flat_force(flat_p) + flat_impulse
     matrix = jnp.eye(flat_p.size, dtype=flat_p.dtype) - step_size / 2 * slope
     matrices = None
     if flat_p.size > _MAX_SOLVED:
@@ -144,7 +144,7 @@ def _after_own_friction(
     force: Callable[[PyTree[Array]], PyTree[Array]],
     h: RealScalarLike,
     p: PyTree[Array],
-    kick: PyTree[Array],
+    impulse: PyTree[Array],
 ) -> PyTree[Array]:
     """`after_friction` where the `force` on each momentum depends on this momentum alone:
     one equation each."""
@@ -152,11 +152,11 @@ def _after_own_friction(
     ones = jtu.tree_map(jnp.ones_like, p)
     forces, slopes = jax.jvp(force, (p,), (ones,))
 
-    def after_step(p: Array, force: Array, slope: Array, kick: Array) -> Array:
+    def after_step(p: Array, force: Array, slope: Array, impulse: Array) -> Array:
         step_size = jnp.asarray(h, jnp.result_type(p))
-        return p + (step_size * force + kick) / (1 - step_size / 2 * slope)
+        return p + (step_size * force + impulse) / (1 - step_size / 2 * slope)
 
-    return jtu.tree_map(after_step, p, forces, slopes, kick)
+    return jtu.tree_map(after_step, p, forces, slopes, impulse)
 
 
 class _Matrices(NamedTuple):

@@ -1,6 +1,7 @@
 """Steps of constrained systems."""
 
 import functools as ft
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -59,18 +60,18 @@ def verlet_step(
     t1: RealScalarLike,
     y0: Y,
     args: Args,
-    before: optx.RESULTS,
+    last_outcome: optx.RESULTS,
     solver_name: str,
 ) -> tuple[Y, optx.RESULTS]:
-    """A step of [`diffrax_symplectic.StormerVerlet`][] on the surface, and its result,
-    which is the state of the solver. `before` is the state before the step. `solver_name`
-    is for errors about the path."""
+    """A step of [`diffrax_symplectic.StormerVerlet`][] on the surface, and the outcome of
+    all steps so far, which is the state of the solver. `last_outcome` is the outcome before
+    this step. `solver_name` is for errors about the path."""
     surface = Surface.of(terms, t0, y0, args)
     drift, noise = split_terms(without_constraint(terms))
     (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
     half = (t1 - t0) / 2
     # A path that failed before needs no multipliers: in a batch, others would wait for it.
-    pending = before == optx.RESULTS.successful
+    pending = last_outcome == optx.RESULTS.successful
 
     p, q, first_found = surface.free_flight(p, surface.normal_space(q), half, pending)
     # The momentum is not tangent here. It need not be: forces do not depend on it, and the
@@ -79,11 +80,11 @@ def verlet_step(
     force_kick, _ = drift_change(drift, t0, t1, args)(t0 + half, y)
     p = p + jfu.ravel_pytree(force_kick)[0]
     if len(noise) > 0:
-        p = p + _noise_kick(noise, t0, t1, y, args, solver_name)
+        p = p + _noise_change(noise, t0, t1, y, args, solver_name)
     p, q, second_found = surface.free_flight(p, surface.normal_space(q), half, pending)
     p = surface.tangent(p, surface.normal_space(q))
     y1 = (unravel_p(p), unravel_q(q))
-    return _end_and_outcome(y1, first_found & second_found, before)
+    return _end_and_outcome(y1, first_found & second_found, last_outcome)
 
 
 class ConstrainedState(NamedTuple):
@@ -131,76 +132,66 @@ def baoab_step(
     t1: RealScalarLike,
     y0: Y,
     args: Args,
-    before: ConstrainedState,
+    solver_state: ConstrainedState,
     made_jump: Any,
     solver_name: str,
 ) -> tuple[Y, ConstrainedState]:
-    """A step of [`diffrax_symplectic.BAOAB`][] on the surface, and the state after it.
-    `solver_name` is for errors about the path."""
+    """A step of [`diffrax_symplectic.BAOAB`][] on the surface, and the state of the solver
+    after it. `solver_name` is for errors about the path."""
     surface = Surface.of(terms, t0, y0, args)
     kicks, rest = _kicks_and_rest(flow, terms)
     _, friction, noise = split_friction(without_constraint(terms))
     (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
     half = jnp.asarray((t1 - t0) / 2, p.dtype)
     middle = t0 + (t1 - t0) / 2
-    pending = before.outcome == optx.RESULTS.successful
-
-    def follow(
-        p: Array,
-        normal_space: NormalSpace,
-        begin: RealScalarLike,
-        end: RealScalarLike,
-        flow_state: PyTree,
-    ) -> _AfterFlow:
-        """Half a step of the flow from these momenta and the position of the normal
-        space."""
-        if flow is None:
-            p, q, found = surface.free_flight(p, normal_space, half, pending)
-            return _AfterFlow(p, q, flow_state, found)
-        y = (unravel_p(p), unravel_q(normal_space.q))
-        y, flow_state, result = after_flow(
-            flow, steps, rest, begin, end, half, y, args, flow_state
-        )
-        (p, _), (q, _) = map(jfu.ravel_pytree, y)
-        return _AfterFlow(p, q, flow_state, result == diffrax.RESULTS.successful)
+    half_step_of_flow = _HalfStepOfFlow(
+        surface=surface,
+        flow=flow,
+        steps=steps,
+        terms=rest,
+        args=args,
+        unravel_p=unravel_p,
+        unravel_q=unravel_q,
+        half=half,
+        pending=solver_state.outcome == optx.RESULTS.successful,
+    )
 
     # B and A. Between them the momentum need not be tangent: the multipliers of the flight
     # make up for it.
     force = None
     if kicks:
         compute_force = ft.partial(_force, kicks, t0, y0, args)
-        force = forces_at_start(before.force, made_jump, compute_force)
+        force = forces_at_start(solver_state.force, made_jump, compute_force)
         p = p + half * force
-    p, q, flow_state, first_found = follow(
-        p, surface.normal_space(q), t0, middle, before.flow
+    p, q, flow_state, first_found = half_step_of_flow.take(
+        p, surface.normal_space(q), t0, middle, solver_state.flow
     )
     normal_space = surface.normal_space(q)
     p = surface.tangent(p, normal_space)
     y = (unravel_p(p), unravel_q(q))
     # O
-    kick = (
-        _noise_kick(noise, t0, t1, y, args, solver_name) if noise else jnp.zeros_like(p)
-    )
+    if noise:
+        noise_change = _noise_change(noise, t0, t1, y, args, solver_name)
+    else:
+        noise_change = jnp.zeros_like(p)
 
-    # Friction acts on the impulses of the constraint forces, too: then friction and noise
-    # are the midpoint rule within the tangent space, which keeps its Maxwell distribution.
     def after_bath(impulse: Array) -> Array:
+        """The momenta after friction over the step, with this impulse in the course of
+        it."""
         p = after_friction(friction, middle, t1 - t0, y, args, unravel_p(impulse))
         return jfu.ravel_pytree(p)[0]
 
-    def response(impulse: Array) -> Array:
-        _, change_of_p = jax.jvp(after_bath, (kick,), (impulse,))
-        return change_of_p
-
-    p = surface.tangent(after_bath(kick), normal_space, response)
+    p = _tangent_after_bath(surface, normal_space, after_bath, noise_change)
     # A and B
-    p, q, flow_state, second_found = follow(p, normal_space, middle, t1, flow_state)
+    p, q, flow_state, second_found = half_step_of_flow.take(
+        p, normal_space, middle, t1, flow_state
+    )
     if kicks:
         force = _force(kicks, t1, (unravel_p(p), unravel_q(q)), args)
         p = p + half * force
     p = surface.tangent(p, surface.normal_space(q))
     y1 = (unravel_p(p), unravel_q(q))
-    y1, outcome = _end_and_outcome(y1, first_found & second_found, before.outcome)
+    y1, outcome = _end_and_outcome(y1, first_found & second_found, solver_state.outcome)
     return y1, ConstrainedState(force, flow_state, outcome)
 
 
@@ -209,13 +200,83 @@ class _AfterFlow(NamedTuple):
 
     - `p`, `q`: the momenta and positions, as vectors.
     - `state`: the state of the flow.
-    - `found`: whether it succeeded, and found the multipliers.
+    - `found`: whether the flow succeeded, and found the multipliers.
     """
 
     p: Array
     q: Array
     state: PyTree
     found: Bool[Array, ""]
+
+
+class _HalfStepOfFlow(NamedTuple):
+    """What both half steps of the flow, A, have in common.
+
+    - `surface`: the surface of the constraint.
+    - `flow`, `steps`: the flow, and the number of its steps if it is a solver.
+    - `terms`, `args`: what the flow follows.
+    - `unravel_p`, `unravel_q`: from vectors to momenta and positions.
+    - `half`: the length of half a step.
+    - `pending`: whether multipliers have to be found; not for a path that failed before.
+    """
+
+    surface: Surface
+    flow: Flow
+    steps: int
+    terms: Terms
+    args: Args
+    unravel_p: Callable[[Array], PyTree]
+    unravel_q: Callable[[Array], PyTree]
+    half: Array
+    pending: Bool[Array, ""]
+
+    def take(
+        self,
+        p: Array,
+        normal_space: NormalSpace,
+        begin: RealScalarLike,
+        end: RealScalarLike,
+        flow_state: PyTree,
+    ) -> _AfterFlow:
+        """Half a step of the flow from these momenta and the position of the normal
+        space."""
+        if self.flow is None:
+            p, q, found = self.surface.free_flight(
+                p, normal_space, self.half, self.pending
+            )
+            return _AfterFlow(p, q, flow_state, found)
+        y = (self.unravel_p(p), self.unravel_q(normal_space.q))
+        y, flow_state, result = after_flow(
+            self.flow,
+            self.steps,
+            self.terms,
+            begin,
+            end,
+            self.half,
+            y,
+            self.args,
+            flow_state,
+        )
+        (p, _), (q, _) = map(jfu.ravel_pytree, y)
+        return _AfterFlow(p, q, flow_state, result == diffrax.RESULTS.successful)
+
+
+def _tangent_after_bath(
+    surface: Surface,
+    normal_space: NormalSpace,
+    after_bath: Callable[[Array], Array],
+    noise_change: Array,
+) -> Array:
+    """The tangent momenta after friction and noise, as a vector. `after_bath(impulse)` are
+    the momenta after friction with this impulse, which changes them as noise does."""
+
+    # Friction acts on the impulses of the constraint forces, too: then friction and noise
+    # are the midpoint rule within the tangent space, which keeps its Maxwell distribution.
+    def response(impulse: Array) -> Array:
+        _, change_of_p = jax.jvp(after_bath, (noise_change,), (impulse,))
+        return change_of_p
+
+    return surface.tangent(after_bath(noise_change), normal_space, response)
 
 
 def _kicks_and_rest(flow: Flow, terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
@@ -235,7 +296,7 @@ def _force(kicks: Terms, t: RealScalarLike, y: Y, args: Args) -> Array:
     return jfu.ravel_pytree(force)[0]
 
 
-def _noise_kick(
+def _noise_change(
     noise: Terms,
     t0: RealScalarLike,
     t1: RealScalarLike,
@@ -245,19 +306,19 @@ def _noise_kick(
 ) -> Array:
     """The change of the momenta by the noise, as a vector."""
     variables = drawn_variables(noise, ["W"], t0, t1, solver_name)
-    kick, _ = apply(noise, variables["W"], args, t0 + (t1 - t0) / 2, y)
-    return jfu.ravel_pytree(kick)[0]
+    change, _ = apply(noise, variables["W"], args, t0 + (t1 - t0) / 2, y)
+    return jfu.ravel_pytree(change)[0]
 
 
 def _end_and_outcome(
-    y1: Y, found: Bool[Array, ""], before: optx.RESULTS
+    y1: Y, found: Bool[Array, ""], last_outcome: optx.RESULTS
 ) -> tuple[Y, optx.RESULTS]:
     """The end of a step, and the outcome of all steps so far, from whether the multipliers
-    of this one were `found` and the outcome `before`."""
+    of this one were `found` and the outcome before this step."""
     R: Any = optx.RESULTS
     outcome = R.where(found, R.successful, R.nonlinear_max_steps_reached)
     # The first failure is the one that is reported.
-    outcome = R.where(before == R.successful, outcome, before)
+    outcome = R.where(last_outcome == R.successful, outcome, last_outcome)
 
     # Without a solution there is no derivative. It is set to zero, so that a failed path
     # does not spoil gradients that are summed over a batch.

@@ -149,16 +149,16 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         follow = ft.partial(after_flow, self.flow, self.steps, rest)
         (p, q), flow_state, _ = follow(t0, middle, half, (p, q), args, flow_state)
         # Friction and noise
-        kick = None
+        noise_change = None
         if len(noise) > 0:
             variables = drawn_variables(noise, ["W"], t0, t1, type(self).__name__)
-            kick, _ = apply(noise, variables["W"], args, middle, (p, q))
-        p = after_friction(friction, middle, h, (p, q), args, kick)
-        # Flow. Free flight takes its velocities at the time `begin`, on which they do not
-        # depend: `t1` is the time of the forces below.
-        begin = t1 if self.flow is None else middle
+            noise_change, _ = apply(noise, variables["W"], args, middle, (p, q))
+        p = after_friction(friction, middle, h, (p, q), args, noise_change)
+        # Flow. Velocities of free flight do not depend on time. Taken at `t1`, the time of the
+        # forces below, they share with these what depends on time alone.
+        start = t1 if self.flow is None else middle
         (p, q), flow_state, flow_result = follow(
-            begin, t1, half, (p, q), args, flow_state
+            start, t1, half, (p, q), args, flow_state
         )
         # Kick
         if self.symmetric and kicks:

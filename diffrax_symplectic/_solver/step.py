@@ -26,8 +26,9 @@ from .._terms import tree_sum
 # several stages that are evaluated together are stacked along a first axis.
 _Value: TypeAlias = PyTree[Array]
 # The values of the stages known so far, by stage number.
-Values: TypeAlias = dict[int, _Value]
-# The values of the unknown stages: for each block, for each of its groups.
+KnownValues: TypeAlias = dict[int, _Value]
+# The values of the unknown stages: for each block, for each of its groups. In the comments
+# and root finders these are the unknowns k.
 Unknown: TypeAlias = list[list[_Value]]
 # The change of the state by one channel over the whole step, its vector field times its
 # control, as a function of time and state.
@@ -75,21 +76,23 @@ class Stages(eqx.Module):
         """The unknown values of all blocks, one block after another, each with the values
         of earlier blocks; and whether all blocks are solved. `solve` is called as
         `solve(image, scale, guess, pending)` and returns these for one block."""
-        values: Values = {}
+        known: KnownValues = {}
         unknown = []
         all_solved = jnp.array(True)
-        for block, k in zip(self.plan.blocks, guess):
+        for block, unknown_of_block in zip(self.plan.blocks, guess):
             if block.unknown:
-                k, block_solved = self._solve_block(block, values, solve, k, pending)
+                unknown_of_block, block_solved = self._solve_block(
+                    block, known, solve, unknown_of_block, pending
+                )
                 all_solved = all_solved & block_solved
-            unknown.append(k)
-            values = self._with_block(block, values, k, keep=True)
+            unknown.append(unknown_of_block)
+            known = self._with_block(block, known, unknown_of_block, keep=True)
         return unknown, all_solved
 
     def _solve_block(
         self,
         block: Block,
-        known: Values,
+        known: KnownValues,
         solve: Callable,
         guess: list[_Value],
         pending: Bool[Array, ""],
@@ -99,84 +102,98 @@ class Stages(eqx.Module):
         are_pairs = all(type(value) is tuple and len(value) == 2 for value in guess)
 
         # From [(p_1, q_1), (p_2, q_2), ...] to ((p_1, p_2, ...), (q_1, q_2, ...)).
-        def in_halves(k: list[_Value]) -> Any:
-            return Halves(*zip(*k)) if are_pairs else k
+        def in_halves(values: list[_Value]) -> Any:
+            return Halves(*zip(*values)) if are_pairs else values
 
-        def by_group(k: Any) -> list[_Value]:
-            return [*zip(*k)] if are_pairs else k
+        # The inverse of `in_halves`.
+        def by_group(halves: Any) -> list[_Value]:
+            return [*zip(*halves)] if are_pairs else halves
 
-        def image(k: Any) -> Any:
-            return in_halves(self._image(block, known, by_group(k)))
+        def image(halves: Any) -> Any:
+            return in_halves(self._image_of_block(block, known, by_group(halves)))
 
-        def scale(k: Any) -> Any:
-            return in_halves(self._scale(block, by_group(k)))
+        def scale(halves: Any) -> Any:
+            return in_halves(self._scale_of_block(block, by_group(halves)))
 
-        k, is_solved = solve(image, scale, in_halves(guess), pending)
-        return by_group(k), is_solved
+        solution, is_solved = solve(image, scale, in_halves(guess), pending)
+        return by_group(solution), is_solved
 
     def image(self, unknown: Unknown) -> Unknown:
         r"""The values $\Phi(k)$ that the stage equations of the whole step give to its
         unknown stages, if they have the values $k$. A solution is a fixed point."""
-        values: Values = {}
+        known: KnownValues = {}
         image = []
-        for block, k in zip(self.plan.blocks, unknown):
-            image.append(self._image(block, values, k))
-            values = self._with_block(block, values, k)
+        for block, unknown_of_block in zip(self.plan.blocks, unknown):
+            image.append(self._image_of_block(block, known, unknown_of_block))
+            known = self._with_block(block, known, unknown_of_block)
         return image
 
-    def _image(self, block: Block, known: Values, k: list[_Value]) -> list[_Value]:
-        r"""$\Phi(k)$ for the unknown values `k` of one block, with the `known` values of
-        earlier blocks."""
-        values = self._with_block(block, known, k)
-        return [self._evaluate_group(group, values) for group in block.unknown]
+    def _image_of_block(
+        self, block: Block, known: KnownValues, unknown_of_block: list[_Value]
+    ) -> list[_Value]:
+        """`image` for the unknown values of one block, with the known values of earlier
+        blocks."""
+        known = self._with_block(block, known, unknown_of_block)
+        return [self._evaluate_group(group, known) for group in block.unknown]
 
     def _with_block(
-        self, block: Block, values: Values, unknown: list[_Value], keep: bool = False
-    ) -> Values:
-        """`values` with the stages of a block added. With `keep`, explicit stages that
-        enter several positions are computed only once."""
+        self,
+        block: Block,
+        known: KnownValues,
+        unknown_of_block: list[_Value],
+        keep: bool = False,
+    ) -> KnownValues:
+        """`known` with the stages of a block added, from the values of its unknown stages.
+        With `keep`, explicit stages that enter several positions are computed only once."""
         # A new dictionary each time: the root finder traces an iteration more than once,
         # from the same known values.
-        for group, value in zip(block.unknown, unknown):
-            values = values | _unstack(group, value)
+        for group, value in zip(block.unknown, unknown_of_block):
+            known = known | _unstack(group, value)
         for group in block.explicit:
-            evaluate = ft.partial(self._evaluate_group, group, values)
+            evaluate = ft.partial(self._evaluate_group, group, known)
             # Within an iteration, storing a value costs as much as computing it again.
             is_shared = keep and _num_uses(self.plan.tableau, group) > 1
             value = materialize(evaluate) if is_shared else evaluate()
-            values = values | _unstack(group, value)
-        return values
+            known = known | _unstack(group, value)
+        return known
 
     def end(self, unknown: Unknown) -> Y:
         """The state at the end of the step, from the values of its unknown stages."""
         tableau = self.plan.tableau
-        values: Values = {}
-        for block, k in zip(self.plan.blocks, unknown):
-            values = self._with_block(block, values, k, keep=True)
-        return _position(self.y0, tableau.stages, tableau.weights[None], values)
+        known: KnownValues = {}
+        for block, unknown_of_block in zip(self.plan.blocks, unknown):
+            known = self._with_block(block, known, unknown_of_block, keep=True)
+        return _position(self.y0, tableau.stages, tableau.weights[None], known)
 
     def scale(self, unknown: Unknown) -> Unknown:
         """The size of the state that unknown values change, which sets their tolerance."""
-        return [self._scale(block, k) for block, k in zip(self.plan.blocks, unknown)]
+        return [
+            self._scale_of_block(block, unknown_of_block)
+            for block, unknown_of_block in zip(self.plan.blocks, unknown)
+        ]
 
-    def _scale(self, block: Block, unknown: list[_Value]) -> list[_Value]:
+    def _scale_of_block(
+        self, block: Block, unknown_of_block: list[_Value]
+    ) -> list[_Value]:
         """`scale` for the unknown values of one block."""
 
-        def size(y: Array, k: Array) -> Array:
+        def size(y: Array, value: Array) -> Array:
             # With the value itself, a step from rest has a scale, too.
-            return jnp.abs(y) + jnp.abs(k)
+            return jnp.abs(y) + jnp.abs(value)
 
         def scale(group: Group, value: _Value) -> _Value:
             changed_part = _part(self.y0, self.plan.tableau.stages[group[0]].writes)
             return jtu.tree_map(size, changed_part, value)
 
-        return [scale(group, k) for group, k in zip(block.unknown, unknown)]
+        return [
+            scale(group, value) for group, value in zip(block.unknown, unknown_of_block)
+        ]
 
-    def _evaluate_group(self, group: Group, values: Values) -> _Value:
+    def _evaluate_group(self, group: Group, known: KnownValues) -> _Value:
         """The values of stages of one kind, stacked unless there is only one."""
         tableau = self.plan.tableau
         rows = tableau.matrix[list(group)]
-        position = _position(self.y0, tableau.stages, rows, values)
+        position = _position(self.y0, tableau.stages, rows, known)
         return _evaluate(self.step, [tableau.stages[i] for i in group], position)
 
 
@@ -203,7 +220,7 @@ def _num_uses(tableau: FlatTableau, group: Group) -> int:
     return int(np.count_nonzero(is_used))
 
 
-def _unstack(group: Group, value: _Value) -> Values:
+def _unstack(group: Group, value: _Value) -> KnownValues:
     """The values of a group by stage number, from its stacked `value`."""
     if len(group) == 1:
         (number,) = group
@@ -242,10 +259,10 @@ def _part(y: PyTree, part: str) -> PyTree:
 
 
 def _position(
-    y0: Y, stages: tuple[Stage, ...], rows: np.ndarray, values: Values
+    y0: Y, stages: tuple[Stage, ...], rows: np.ndarray, known: KnownValues
 ) -> PyTree[Array]:
-    """`y0 + sum_i rows[:, i] values[i]`: a position for each of these rows of coefficients,
-    stacked unless there is only one. `values` may hold stages that these rows do not use,
+    """`y0 + sum_i rows[:, i] known[i]`: a position for each of these rows of coefficients,
+    stacked unless there is only one. `known` may hold stages that these rows do not use,
     with coefficients of zero; stages that are not in it count as zero."""
 
     def moved(part: str) -> PyTree[Array]:
@@ -255,7 +272,7 @@ def _position(
         # and infinity is NaN.
         products = [
             _product(rows[:, i], value)
-            for i, value in values.items()
+            for i, value in known.items()
             if rows[:, i].any() and stages[i].writes == part
         ]
         if products:
@@ -297,21 +314,21 @@ def take_step(
     step: Step,
     y0: Y,
     solver: diffrax.AbstractSolver,
-    before: Outcome = None,
+    last_outcome: Outcome = None,
 ) -> tuple[Y, Outcome]:
     """The end of the step, and whether its stage equations were solved, by the root finder
-    of `solver`. A path that failed `before` is skipped."""
+    of `solver`. A path that failed before, by its `last_outcome`, is skipped."""
     if plan.num_unknown == 0:
         no_unknown: Unknown = [[] for _ in plan.blocks]
-        return Stages(plan, step, y0).end(no_unknown), before
+        return Stages(plan, step, y0).end(no_unknown), last_outcome
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         raise ValueError(
             f"The tableau of `{type(solver).__name__}` has implicit stages. Let the class "
             "also inherit from `diffrax_symplectic.AbstractImplicitStages`."
         )
-    before = no_failure() if before is None else before
+    last_outcome = no_failure() if last_outcome is None else last_outcome
     return _jitted_implicit_step(
-        plan, step, y0, before, solver.root_finder, solver.root_find_max_steps
+        plan, step, y0, last_outcome, solver.root_finder, solver.root_find_max_steps
     )
 
 
@@ -337,27 +354,35 @@ def result_of(outcome: Outcome, y1: Y) -> diffrax.RESULTS:
 # Diffrax traces a step three times or more. Under `filter_jit` that is done once.
 @eqx.filter_jit
 def _jitted_implicit_step(
-    plan: StepPlan, step: Step, y0: Y, before, finder: Any, max_steps: int
-):
+    plan: StepPlan,
+    step: Step,
+    y0: Y,
+    last_outcome: optx.RESULTS,
+    finder: Any,
+    max_steps: int,
+) -> tuple[Y, optx.RESULTS]:
+    """The end of the step, and whether its stage equations were solved."""
     stages = Stages(plan, with_explicit_arrays(step, y0), y0)
-    y1, _, outcome = _implicit_step(stages, before, finder=finder, max_steps=max_steps)
+    y1, _, outcome = _implicit_step(
+        stages, last_outcome, finder=finder, max_steps=max_steps
+    )
     return y1, outcome
 
 
 @eqx.filter_custom_jvp
 def _implicit_step(
-    stages: Stages, before: optx.RESULTS, *, finder: Any, max_steps: int
+    stages: Stages, last_outcome: optx.RESULTS, *, finder: Any, max_steps: int
 ) -> tuple[Y, Unknown, optx.RESULTS]:
     """The end of the step, the values of its unknown stages, and whether they solve the
-    stage equations. No time is spent on paths that failed `before`."""
+    stage equations. No time is spent on paths that failed before, by `last_outcome`."""
     if isinstance(finder, optx.BestSoFarRootFinder):
         raise ValueError(
             "`BestSoFarRootFinder` returns an iterate from before the last correction, "
             "which does not solve the stage equations. Pass the root finder that it wraps."
         )
-    failed_before = _failed(before)
+    failed_before = _failed(last_outcome)
     guess = [stages.zeros_for(block) for block in stages.plan.blocks]
-    guess, failed_before = batched_like((guess, failed_before), (stages, before))
+    guess, failed_before = batched_like((guess, failed_before), (stages, last_outcome))
     # A guess that is not finite makes the root finder stop at once.
     guess = jtu.tree_map(lambda k: jnp.where(failed_before, jnp.nan, k), guess)
     sol = optx.root_find(
@@ -370,16 +395,16 @@ def _implicit_step(
         max_steps=max_steps,
         throw=False,
     )
-    result = optx.RESULTS.where(failed_before, before, sol.result)
+    result = optx.RESULTS.where(failed_before, last_outcome, sol.result)
     return stages.end(sol.value), sol.value, result
 
 
 @_implicit_step.def_jvp
 def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
-    stages, before = primals
+    stages, last_outcome = primals
     t_stages, _ = tangents
     y1, unknown, result = _implicit_step(
-        stages, before, finder=finder, max_steps=max_steps
+        stages, last_outcome, finder=finder, max_steps=max_steps
     )
     # Without a solution there is no derivative. It is set to zero, so that a failed path
     # does not spoil gradients that are summed over a batch.

@@ -8,7 +8,7 @@ all of them.
 
     lowered = jax.jit(fn).lower(jax.ShapeDtypeStruct((3,), "float32"))
     replay = Replay(lowered.as_text())
-    results, errors = replay(Tensor([x, y, z], (3,)))
+    results, failures = replay(Tensor([x, y, z], (3,)))
 
 Dr.Jit records the operations and compiles them when values are asked for. So a replay may
 stand within a loop of Dr.Jit, and becomes part of one kernel with it.

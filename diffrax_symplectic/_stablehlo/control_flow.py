@@ -90,13 +90,14 @@ def _conditional(
     # A symbolic conditional is a part of the kernel. Otherwise Dr.Jit may run a branch at
     # once.
     results = drjit().if_stmt(
-        (),
-        condition,
-        _returning_failures(operation, if_true),
-        _returning_failures(operation, if_false),
+        args=(),
+        cond=condition,
+        true_fn=_returning_failures(operation, if_true),
+        false_fn=_returning_failures(operation, if_false),
         mode="symbolic",
     )
-    # A constant of the inside would abort the process if it were used outside.
+    # A constant of the inside would abort the process if it were used outside, so constants
+    # are made anew.
     *entries, failed = map(as_own_literal, results)
     operation.fail(failed)
     return tuple(entries)
@@ -197,8 +198,12 @@ def _loop(
     # Where no lane can fail, Dr.Jit leaves the mask out.
     no_lane = array_types()["i1"](False)
     results = drjit().while_loop(
-        (no_lane, *entries_of(variables)), goes_on, iterate, mode="symbolic"
+        state=(no_lane, *entries_of(variables)),
+        cond=goes_on,
+        body=iterate,
+        mode="symbolic",
     )
+    # Constants are made anew, as in `_conditional`.
     failed, *entries = map(as_own_literal, results)
     operation.fail(failed)
     state_at_end = whole_state(entries)

@@ -60,24 +60,24 @@ def _with_same_bits(prefix: str, a: Any) -> Any:
     return array_types()[f"{prefix}{8 * drjit().itemsize_v(a)}"](a)
 
 
-def to_integer(kind: type, a: Any) -> Any:
+def to_integer(dtype: type, a: Any) -> Any:
     """The floating-point number `a` as an integer of this type, rounded to zero. What
     StableHLO leaves open is as in JAX: NaN becomes zero, and numbers out of range the
     smallest or the largest integer."""
     dr = drjit()
-    dtype = type(a)
-    is_signed = dr.is_signed_v(kind)
-    bits = 8 * dr.itemsize_v(kind)
+    float_dtype = type(a)
+    is_signed = dr.is_signed_v(dtype)
+    bits = 8 * dr.itemsize_v(dtype)
     # The first whole number above the range, a power of two, and the float before it.
     end = 2 ** (bits - 1 if is_signed else bits)
     float_below_end = float(np.nextafter(end, 0, dtype=f"f{dr.itemsize_v(a)}"))
     least = -end if is_signed else 0
-    below_end = dr.select(a < end, a, dtype(float_below_end))
-    in_range = dr.select(a > least, below_end, dtype(least))
+    below_end = dr.select(a < end, a, float_dtype(float_below_end))
+    in_range = dr.select(a > least, below_end, float_dtype(least))
     # Dr.Jit has no conversion to integers of eight bits.
-    integer = kind(array_types()["i32"](in_range)) if bits < 32 else kind(in_range)
+    integer = dtype(array_types()["i32"](in_range)) if bits < 32 else dtype(in_range)
     # If the largest integer is no float, larger numbers have become a smaller integer.
     if int(float_below_end) < end - 1:
-        integer = dr.select(a < end, integer, kind(end - 1))
+        integer = dr.select(a < end, integer, dtype(end - 1))
     is_nan = ~(a == a)
-    return dr.select(is_nan, kind(0), integer)
+    return dr.select(is_nan, dtype(0), integer)

@@ -16,13 +16,13 @@ from .tensor import constant, entries_of, map_entries, Tensor
 
 @rule
 def _constant(operation: Operation) -> list[Tensor]:
-    return [constant(operation.kind, operation.value)]
+    return [constant(operation.dtype, operation.value)]
 
 
 @rule
 def _iota(operation: Operation) -> list[Tensor]:
     indices = np.indices(operation.shape)[operation.integer("iota_dimension")]
-    return [constant(operation.kind, indices)]
+    return [constant(operation.dtype, indices)]
 
 
 @rule
@@ -91,19 +91,19 @@ def _pad(operation: Operation, x: Tensor, value: Tensor) -> list[Tensor]:
 
 @rule
 def _convert(operation: Operation, x: Tensor) -> list[Tensor]:
-    return [map_entries(ft.partial(_converted, operation.kind), x)]
+    return [map_entries(ft.partial(_converted, operation.dtype), x)]
 
 
-def _converted(kind: type, entry: Any) -> Any:
+def _converted(dtype: type, entry: Any) -> Any:
     """An entry as a number of this type of Dr.Jit."""
     dr = drjit()
-    if type(entry) is kind:
+    if type(entry) is dtype:
         return entry
-    if dr.is_mask_v(kind):
+    if dr.is_mask_v(dtype):
         return ~(entry == 0)
-    if dr.is_float_v(entry) and dr.is_integral_v(kind):
-        return to_integer(kind, entry)
-    return kind(entry)
+    if dr.is_float_v(entry) and dr.is_integral_v(dtype):
+        return to_integer(dtype, entry)
+    return dtype(entry)
 
 
 @rule
@@ -115,14 +115,14 @@ def _bitcast_convert(operation: Operation, x: Tensor) -> list[Tensor]:
         )
 
     def reinterpreted(entry: Any) -> Any:
-        return drjit().reinterpret_array(operation.kind, entry)
+        return drjit().reinterpret_array(operation.dtype, entry)
 
     return [map_entries(reinterpreted, x)]
 
 
 @rule
 def _complex(operation: Operation, real: Tensor, imag: Tensor) -> list[Tensor]:
-    return [map_entries(operation.kind, real, imag)]
+    return [map_entries(operation.dtype, real, imag)]
 
 
 @rule

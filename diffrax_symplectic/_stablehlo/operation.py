@@ -36,13 +36,13 @@ class Operation(NamedTuple):
     - `mlir_op`: the object of MLIR.
     - `run`: `run(i, arguments)` returns the results of region number `i`, such as the body
         of a loop.
-    - `errors`: masks of the lanes that raise an error, to which rules append. The caller
-        of the program sees to these lanes.
+    - `failures`: masks of the lanes that fail, for example since the program would raise an
+        error there. Rules append to them. The caller of the program sees to these lanes.
     """
 
     mlir_op: Any
     run: Callable[..., list[Tensor]]
-    errors: list[Any]
+    failures: list[Any]
 
     @property
     def full_name(self) -> str:
@@ -60,7 +60,7 @@ class Operation(NamedTuple):
         return tuple(self.mlir_op.results[0].type.shape)
 
     @property
-    def kind(self) -> Any:
+    def dtype(self) -> Any:
         """The type of Dr.Jit arrays for the entries of the first result. Raises a
         `NotReplayed` if Dr.Jit has none."""
         type_of_result = self.mlir_op.results[0].type
@@ -121,18 +121,18 @@ class Operation(NamedTuple):
         """Marks the lanes of this mask as failed."""
         # Often it is known while the kernel is recorded that no lane fails.
         if not (is_literal(mask) and not mask[0]):
-            self.errors.append(mask)
+            self.failures.append(mask)
 
     def with_failures(self, fn: Callable[[], Any]) -> tuple[Any, Any]:
         """What `fn` returns, and the mask of the lanes that fail in it, which are taken out
-        of `errors`: a mask that is recorded within a loop or branch cannot be used outside,
-        so the loop or branch has to return it."""
-        num_before = len(self.errors)
+        of `failures`: a mask that is recorded within a loop or branch cannot be used
+        outside, so the loop or branch has to return it."""
+        num_before = len(self.failures)
         returned = fn()
-        new_errors = self.errors[num_before:]
-        del self.errors[num_before:]
+        new_failures = self.failures[num_before:]
+        del self.failures[num_before:]
         no_lane = array_types()["i1"](False)
-        return returned, ft.reduce(operator.or_, new_errors, no_lane)
+        return returned, ft.reduce(operator.or_, new_failures, no_lane)
 
 
 def _without_dialect(full_name: str) -> str:

@@ -27,20 +27,38 @@ def rule_of(name: str) -> Rule | None:
         return RULES.get(name)
 
     def entry_by_entry(operation: Operation, *xs: Tensor) -> list[Tensor]:
-        if name == "select" and same_table(xs[1], xs[2]):
-            # `vmap` of a conditional selects between two equal tables: one stays in memory.
-            return [xs[1]]
         # Any operand may be the complex one: the first of a selection is its mask.
-        has_complex_operand = any(is_complex(x.entries[0]) for x in xs)
+        has_complex_operand = any(map(_has_complex_entries, xs))
         function = of_complex if has_complex_operand else of_real
         if function is None:
-            kind = "complex" if has_complex_operand else "real"
+            numbers = "complex numbers" if has_complex_operand else "real numbers"
             raise NotReplayed(
-                operation.mlir_op, f"`{operation.full_name}` of {kind} numbers"
+                operation.mlir_op, f"`{operation.full_name}` of {numbers}"
             )
         return [map_entries(ft.partial(_applied, operation, function), *xs)]
 
+    if name == "select":
+        return ft.partial(_select, entry_by_entry)
     return entry_by_entry
+
+
+def _has_complex_entries(x: Tensor) -> bool:
+    # There is a first entry: `Replay` asks for no rule of arrays without entries.
+    return is_complex(x.entries[0])
+
+
+def _select(
+    entry_by_entry: Rule,
+    operation: Operation,
+    mask: Tensor,
+    if_true: Tensor,
+    if_false: Tensor,
+) -> list[Tensor]:
+    """The rule of a selection, `entry_by_entry` unless both choices are the same table."""
+    # `vmap` of a conditional selects between two equal tables: one stays in memory.
+    if same_table(if_true, if_false):
+        return [if_true]
+    return entry_by_entry(operation, mask, if_true, if_false)
 
 
 def _applied(operation: Operation, function: Callable, *entries: Any) -> Any:

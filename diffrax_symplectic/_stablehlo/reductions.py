@@ -39,14 +39,14 @@ def _dot_general(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
     batch_size, num_rows, _ = places_in_a.shape
     _, num_columns, _ = places_in_b.shape
     # Products and sums have the type of the result, to which other numbers are converted.
-    kind = operation.kind
-    a_entries = [x if type(x) is kind else kind(x) for x in a.entries]
-    b_entries = [x if type(x) is kind else kind(x) for x in b.entries]
+    dtype = operation.dtype
+    a_entries = [x if type(x) is dtype else dtype(x) for x in a.entries]
+    b_entries = [x if type(x) is dtype else dtype(x) for x in b.entries]
     results = []
     for batch, i, j in np.ndindex(batch_size, num_rows, num_columns):
         row = [a_entries[place] for place in places_in_a[batch, i]]
         column = [b_entries[place] for place in places_in_b[batch, j]]
-        total = kind(0)
+        total = dtype(0)
         if _is_real_float(total):
             total = total + _sum_left_out(row, column) + _sum_left_out(column, row)
         for x, y in zip(row, column):

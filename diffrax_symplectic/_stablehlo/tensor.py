@@ -104,21 +104,22 @@ def scalar(entry: Any) -> Tensor:
     return Tensor([entry], ())
 
 
-def constant(kind: type, values: np.ndarray) -> Tensor:
-    """An array of values that are part of the program. `kind` is a type of Dr.Jit."""
-    return Tensor([kind(value.item()) for value in values.flat], values.shape)
+def constant(dtype: type, values: np.ndarray) -> Tensor:
+    """An array of values that are part of the program. `dtype` is a type of Dr.Jit."""
+    return Tensor([dtype(value.item()) for value in values.flat], values.shape)
 
 
 def array_in_memory(kind: str, values: np.ndarray) -> Any:
-    """A Dr.Jit array with these values as its lanes."""
-    array_type = array_types()[kind]
+    """A Dr.Jit array with these values as its lanes. `kind` is StableHLO's name of their
+    type, as in `ArrayType`."""
+    dtype = array_types()[kind]
     if np.iscomplexobj(values):
         part = kind.removeprefix("complex<").removesuffix(">")
         real = array_in_memory(part, np.real(values))
         imag = array_in_memory(part, np.imag(values))
-        return array_type(real, imag)
+        return dtype(real, imag)
     # A list is copied. Memory of NumPy could be freed while Dr.Jit records.
-    return array_type(values.tolist())
+    return dtype(values.tolist())
 
 
 def known_values(x: Tensor) -> np.ndarray | None:

@@ -173,41 +173,40 @@ def _window_of_table(
         # negative.
         in_range = elementwise()["clamp"](dtype(0), index, dtype(length - size))
         first_address = first_address + int32(in_range) * stride
-    offsets = np.broadcast_to(_offsets(strides, sizes), sizes)
     uint32 = array_types()["ui32"]
     entries = [
-        table.gathered(uint32(first_address + int(offset))) for offset in offsets.flat
+        table.gathered(uint32(first_address + int(offset)))
+        for offset in _offsets(strides, sizes).flat
     ]
     return Tensor(entries, tuple(sizes))
 
 
 def _strides(operation: Operation, addresses: np.ndarray) -> list[int]:
     """For each axis of an array in memory, the distance between neighbours along it,
-    from the addresses of the entries. Raises a `NotReplayed` if distances differ along an axis."""
+    from the addresses of the entries. Raises a `NotReplayed` if distances differ along an
+    axis."""
     first = int(addresses.flat[0])
     strides = [
         int(addresses.take(1, axis).flat[0]) - first if size > 1 else 0
         for axis, size in enumerate(addresses.shape)
     ]
     # Entries that were moved in another way than by slices and transposes have no strides.
-    expected = np.broadcast_to(
-        first + _offsets(strides, addresses.shape), addresses.shape
-    )
-    if not np.array_equal(expected, addresses):
+    if not np.array_equal(first + _offsets(strides, addresses.shape), addresses):
         what = (
-            f"`{operation.full_name}` with an index per path, from an array in another "
-            "order"
+            f"`{operation.full_name}` with an index per path, from an array whose entries "
+            "were moved other than by slices and transposes"
         )
         raise NotReplayed(operation.mlir_op, what)
     return strides
 
 
-def _offsets(strides: Sequence[int], shape: Sequence[int]) -> np.ndarray | int:
-    """How far in memory each entry is from the first, up to broadcasting: the number zero
-    for an array without axes, which has one entry."""
-    # `sparse` indices of an axis have length one along all others: their sum is broadcast.
+def _offsets(strides: Sequence[int], shape: Sequence[int]) -> np.ndarray:
+    """How far in memory each entry of an array of this shape is from the first."""
+    # `sparse` indices of an axis have length one along all others.
     indices = np.indices(shape, sparse=True)
-    return sum(stride * index for stride, index in zip(strides, indices))
+    total = sum(stride * index for stride, index in zip(strides, indices))
+    # Without axes the sum is the number zero.
+    return np.broadcast_to(total, shape)
 
 
 def _widened(index: Tensor) -> Tensor:

@@ -164,9 +164,9 @@ def _(tableau: GeneralTableau) -> dict:
 
 @_strong_conditions.register
 def _(tableau: SeparableTableau) -> dict:
-    # The paper's other random variables depend on `W`, so there is a condition for these,
-    # too.
-    others = _conditions_on_others(tableau.beta, A1e=tableau.A1.sum(axis=1))
+    # The other random variables of the paper are functions of `W`, as in
+    # `_weak_conditions`, so that there is one more condition for each.
+    others = _conditions_on_others(tableau.beta, {"A1e": tableau.A1.sum(axis=1)})
     return _strong_conditions(tableau.partitioned()) | others
 
 
@@ -176,7 +176,7 @@ def _(tableau: PartitionedTableau) -> dict:
         "alpha.e - 1": tableau.alpha.sum() - 1,
         "alpha_hat.e - 1": tableau.alpha_hat.sum() - 1,
         "beta.e - 1": tableau.beta["W"].sum() - 1,
-        **_conditions_on_others(tableau.beta, e=np.ones(len(tableau.A1))),
+        **_conditions_on_others(tableau.beta, {"e": np.ones(len(tableau.A1))}),
     }
 
 
@@ -269,7 +269,7 @@ def _(tableau: PartitionedTableau) -> _WeakConditions:
         "alpha.e - 1": tableau.alpha.sum() - 1,
         "alpha_hat.e - 1": tableau.alpha_hat.sum() - 1,
         "(beta.e)^2 - 1": be.sum() ** 2 - 1,
-        **_conditions_on_others(tableau.beta, e=np.ones(len(A1))),
+        **_conditions_on_others(tableau.beta, {"e": np.ones(len(A1))}),
     }
     # As they are independent, the mean of a product of two vanishes unless they are the
     # same: only squares are left, with the variance as their mean.
@@ -296,15 +296,17 @@ def _(tableau: PartitionedTableau) -> _WeakConditions:
 
 @_weak_conditions.register
 def _(tableau: SeparableTableau) -> _WeakConditions:
-    """With conditions on the paper's other random variables, which depend on `W`."""
-    # The sums over independent variables of a `PartitionedTableau` hold for `W` alone. For
-    # the others the paper has conditions of its own.
+    """With conditions on the other random variables of the method's paper (Wang, Hong and
+    Xu 2017, equations (3.3)-(3.5)), such as `(W^2 - h) / (2 sqrt(h))`: functions of `W`."""
+    # A `PartitionedTableau` has sums over all variables, which assume that they are
+    # independent. Here products of the others with powers of `W` have means other than
+    # zero, so the sums are taken over `W` alone, and for each of the others there are
+    # conditions of its own: its weights times each of these moments vanish.
     only_W = {"W": tableau.B0["W"]}
     weak = _weak_conditions(dataclasses.replace(tableau.partitioned(), B0=only_W))
     B0e = tableau.B0["W"].sum(axis=1)
-    # A dictionary, since "A1(B0e)" is no name of an argument.
     moments = {"A1e": tableau.A1.sum(axis=1), "A1(B0e)": tableau.A1 @ B0e}
-    others = _conditions_on_others(tableau.beta, **moments)
+    others = _conditions_on_others(tableau.beta, moments)
     third_moment = {"beta.A1((B0e)^2)": tableau.beta["W"] @ tableau.A1 @ B0e**2}
     return _WeakConditions(weak.first, weak.second | third_moment | others)
 
@@ -349,10 +351,11 @@ def _check_noise(tableau: GeneralTableau) -> None:
 
 
 def _conditions_on_others(
-    beta: Mapping[str, np.ndarray], **moments: np.ndarray
+    beta: Mapping[str, np.ndarray], moments: Mapping[str, np.ndarray]
 ) -> dict:
     """The residuals of the conditions that the products of the weights `beta` of random
-    variables other than `W` with these `moments` vanish, by formula, as in `beta[H].e`."""
+    variables other than `W` with these `moments` vanish. Both are by name, and the result
+    by formula, such as `beta[H].e`."""
     residuals = {}
     for name, weights in beta.items():
         if name == "W":

@@ -34,7 +34,7 @@ from .langevin import AbstractFriction, bath_terms, BathNoise, friction_apart
 from .langevin import FrictionAlong, langevin_terms, momentum_first
 from .langevin import semidefinite_root, split_friction
 from .lifted import has_lifted
-from .paths import brownian_paths, has_unknown_law, path_keys, path_numbers
+from .paths import brownian_paths, has_unknown_law, motion_numbers, path_keys
 from .paths import random_paths, replace_paths, shapes_as_paths, which_are_shapes
 from .paths import with_keys, with_paths, with_paths_for_shapes
 from .spins import as_spins, from_spinors, spin_terms, to_spinors
@@ -45,5 +45,5 @@ from .structure import constant_fault, Fault, FRICTION, noises_commute
 from .structure import separable_fault, truncated_in_unit
 from .structure import which_need_truncation, without_truncation
 from .symplectic_gradients import IndexedNoise, slow_apart
-from .vector_fields import apply, apply_one, check_fit, rate, tree_sum
+from .vector_fields import apply, apply_one, check_terms_fit_state, rate, tree_sum
 from .waves import from_pair, to_pair, wave_terms

@@ -90,14 +90,14 @@ def has_unknown_law(path: diffrax.AbstractBrownianPath) -> bool:
     return laws_of(path) is None and not _is_unspecified(path)
 
 
-def path_numbers(paths: Sequence[diffrax.AbstractBrownianPath]) -> tuple[int, ...]:
+def motion_numbers(paths: Sequence[diffrax.AbstractBrownianPath]) -> tuple[int, ...]:
     """The number of the Brownian motion that each path samples, counted from 0. Equal paths
     sample the same one; two shapes of paths never do."""
     motions: list[diffrax.AbstractBrownianPath] = []
     numbers = []
     for path in paths:
-        same = (k for k, motion in enumerate(motions) if _are_equal(path, motion))
-        number = next(same, None)
+        equal = (k for k, motion in enumerate(motions) if _are_equal(path, motion))
+        number = next(equal, None)
         if number is None:
             number = len(motions)
             motions.append(path)
@@ -147,7 +147,7 @@ def with_paths(
     make_path: Callable, numbers: tuple[int, ...], terms: PyTree, key: PRNGKeyArray
 ) -> PyTree:
     """The terms with `make_path(shape, key)` in place of each random path. `numbers` are
-    the `path_numbers` of the random paths: those with the same number get the same key.
+    the `motion_numbers` of the random paths: those with the same number get the same key.
     Paths of the user's own classes only get other keys."""
     remaining_numbers = iter(numbers)
 

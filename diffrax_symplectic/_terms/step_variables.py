@@ -26,7 +26,7 @@ from .._brownian import (
 )
 from .._compat import is_traced
 from .._custom_types import RealScalarLike
-from .paths import brownian_paths, path_numbers, replace_paths, shapes_as_paths
+from .paths import brownian_paths, motion_numbers, replace_paths, shapes_as_paths
 
 
 class StepVariables(NamedTuple):
@@ -46,8 +46,8 @@ def step_variables(
     h: RealScalarLike,
     numbers: tuple[int, ...] | None = None,
 ) -> StepVariables:
-    """The variables of a step of size `h`. `numbers` are the `path_numbers` of the paths of
-    the terms, which programs, whose keys are traced, have to be told."""
+    """The variables of a step of size `h`. `numbers` are the `motion_numbers` of the paths
+    of the terms, which programs, whose keys are traced, have to be told."""
     paths = _paths_of_known_laws(terms)
     numbers = _checked_numbers(paths) if numbers is None else numbers
     # Paths with the same number are one Brownian motion, whose variables are drawn once.
@@ -169,15 +169,15 @@ def _paths_of_known_laws(
 
 
 def _checked_numbers(paths: list[diffrax.AbstractBrownianPath]) -> tuple[int, ...]:
-    """The `path_numbers` of paths. Raises a `ValueError` if there are several and they are
-    traced, since it is then not known which are the same."""
+    """The `motion_numbers` of paths. Raises a `ValueError` if there are several and they
+    are traced, since it is then not known which are the same."""
     if len(paths) > 1 and any(map(is_traced, jtu.tree_leaves(paths))):
         raise ValueError(
             "`terms` hold several Brownian paths with traced keys, of which it is not "
             "known whether they are the same. Construct the terms outside of `jax.jit`, "
             "and let the function close over them."
         )
-    return path_numbers(paths)
+    return motion_numbers(paths)
 
 
 def _name_of(path: diffrax.AbstractBrownianPath) -> str:

@@ -96,7 +96,7 @@ def rate(drift: Terms, t: RealScalarLike, y: Y, args: Args) -> Y:
     return apply(drift, controls, args, t, y)
 
 
-def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
+def check_terms_fit_state(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
     """Raises a `ValueError` unless these are terms that fit the state `y0`. (A PyTree of
     terms, as some Diffrax solvers take, is not checked further.)"""
     if not any(map(_is_term, jtu.tree_leaves(terms, is_leaf=_is_term))):
@@ -112,8 +112,9 @@ def check_fit(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
 
     def total_change(t: RealScalarLike) -> Y:
         controls = [term.contr(t, t) for term in parts]
-        return apply(parts, controls, args, t0, y0)
+        return apply(parts, controls, args, t, y0)
 
+    # Tracing is enough: `apply` raises if a term does not fit.
     eqx.filter_eval_shape(total_change, t0)
 
 
@@ -133,6 +134,7 @@ def check_increments(terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> Non
         except (TypeError, ValueError) as error:
             raise _unfit_increments(field, increments, y0) from error
 
+    # Tracing is enough: `product` raises.
     for term in terms:
         if isinstance(unwrapped(term), diffrax.ControlTerm):
             eqx.filter_eval_shape(product, term)

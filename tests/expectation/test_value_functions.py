@@ -403,7 +403,7 @@ def test_a_fit_that_would_take_long_is_coarser_or_told(monkeypatch):
     sites = [at(steps).basis.num_sites for steps in (100, 10_000, 100_000)]
     assert sites == sorted(sites, reverse=True) and len(set(sites)) == 3
     assert 100_000 * 3 * sites[-1] < 2**27
-    monkeypatch.setattr(basis_choice, "_OUT_OF_PROPORTION", 1000)
+    monkeypatch.setattr(basis_choice, "_MOST_WITHOUT_WARNING", 1000)
     with pytest.warns(UserWarning, match="takes as long as .* independent paths"):
         _estimate(ds.ValueFunctions(2, 64))
 

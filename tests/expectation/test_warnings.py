@@ -75,7 +75,7 @@ def test_of_coordinates_to_sort_by():
 
 
 def test_of_a_fit_that_takes_long(monkeypatch):
-    monkeypatch.setattr(basis_choice, "_OUT_OF_PROPORTION", 1)
+    monkeypatch.setattr(basis_choice, "_MOST_WITHOUT_WARNING", 1)
     sampling = ds.ValueFunctions(2, 64)
     here(mean(first, WEAK, jnp.ones(2), sampling), "The fit of `ValueFunctions`")
 

@@ -164,9 +164,10 @@ def _results_with_control(
     )
     plain_spread = _spread_of(n, rounding, moments.norm.plain, moments.largest.plain)
     allowed = np.fmax(_SURE_OF_CONTROL * control_spread.std_error, ROUNDING * rounding)
-    is_kept = np.abs(mean.control) <= allowed
-    is_kept |= control_spread.r > _HEAVY_CONTROL
-    is_kept &= np.isfinite(mean.value)
+    mean_may_be_zero = np.abs(mean.control) <= allowed
+    # With heavy tails the standard error in `allowed` is not reliable.
+    has_heavy_tails = control_spread.r > _HEAVY_CONTROL
+    is_kept = (mean_may_be_zero | has_heavy_tails) & np.isfinite(mean.value)
     # A control variate is kept for all combinations of levels or for none.
     dropped = np.broadcast_to(~np.all(is_kept, axis=0), mean.plain.shape)
     # Tails that the samples show are in their variance already. (NaN, from a trial without

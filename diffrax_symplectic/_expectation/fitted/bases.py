@@ -61,14 +61,14 @@ class CovarianceFrame(eqx.Module):
 
     @staticmethod
     def of(
-        points: Float[Array, "n d"], good: Bool[Array, " n"], unit: Float[Array, " d"]
+        points: Float[Array, "n d"], good: Bool[Array, " n"], scales: Float[Array, " d"]
     ) -> "CovarianceFrame":
-        """The frame along the axes of the covariance of the good points. `unit` makes the
-        components comparable, and is zero for components that do not move."""
+        """The frame along the axes of the covariance of the good points. Divided by
+        `scales`, components are comparable; it is zero for components that do not move."""
         weights = equal_weights(good, points.dtype)
         mean = weights @ points
-        inverse_unit = inverse_or_zero(unit)
-        scaled = (points - mean) * inverse_unit
+        inverse_scales = inverse_or_zero(scales)
+        scaled = (points - mean) * inverse_scales
         covariance = (scaled.T * weights) @ scaled
         # The variances along the axes are in ascending order.
         variances, axes = jnp.linalg.eigh(covariance)
@@ -78,8 +78,8 @@ class CovarianceFrame(eqx.Module):
         deviations = jnp.sqrt(jnp.maximum(variances, least_variance) + tiny)
         return CovarianceFrame(
             mean=mean,
-            to_coordinates=axes.T / deviations[:, None] * inverse_unit,
-            to_states=unit[:, None] * axes * deviations,
+            to_coordinates=axes.T / deviations[:, None] * inverse_scales,
+            to_states=scales[:, None] * axes * deviations,
         )
 
     def perturbed(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
@@ -95,11 +95,11 @@ def equal_weights(good: Bool[Array, " n"], dtype: Any) -> Float[Array, " n"]:
     return good.astype(dtype) / jnp.maximum(jnp.sum(good), 1)
 
 
-def inverse_or_zero(unit: Float[Array, " d"]) -> Float[Array, " d"]:
-    """One over each number that is positive, and otherwise zero."""
-    is_positive = unit > 0
+def inverse_or_zero(scales: Float[Array, " d"]) -> Float[Array, " d"]:
+    """One over each scale that is positive, and otherwise zero."""
+    is_positive = scales > 0
     # The inner `where` avoids a division by zero.
-    return jnp.where(is_positive, 1 / jnp.where(is_positive, unit, 1), 0)
+    return jnp.where(is_positive, 1 / jnp.where(is_positive, scales, 1), 0)
 
 
 class AbstractBasis(eqx.Module):
@@ -107,7 +107,8 @@ class AbstractBasis(eqx.Module):
     from. A function is a linear combination with `size` coefficients. The trailing axes of
     the coefficients are candidates, times at which to average, and components of `phi`."""
 
-    kind: eqx.AbstractClassVar[str]
+    # What a candidate is, for messages.
+    candidate_name: eqx.AbstractClassVar[str]
     d: eqx.AbstractVar[int]
     candidates: eqx.AbstractVar[tuple[int, ...]]
 
@@ -131,10 +132,10 @@ class AbstractBasis(eqx.Module):
         self,
         states: Float[Array, "n d"],
         good: Bool[Array, " n"],
-        unit: Float[Array, " d"],
+        scales: Float[Array, " d"],
     ) -> PyTree:
-        """The coordinates, from the pilot's states, its good paths, and the unit of each
-        component."""
+        """The coordinates, from the pilot's states, its good paths, and a length scale for
+        each component, which is zero for components that do not move."""
 
     @abc.abstractmethod
     def coefficients(
@@ -158,7 +159,7 @@ class AbstractBasis(eqx.Module):
 class Hermite(AbstractBasis):
     """Products of Hermite polynomials, with a candidate for each total degree."""
 
-    kind: ClassVar[str] = "degree"
+    candidate_name: ClassVar[str] = "degree"
     d: int
     candidates: tuple[int, ...]
 
@@ -174,8 +175,8 @@ class Hermite(AbstractBasis):
     def num_sites(self):
         return self.num_pilots
 
-    def frame(self, states, good, unit):
-        return CovarianceFrame.of(states, good, unit)
+    def frame(self, states, good, scales):
+        return CovarianceFrame.of(states, good, scales)
 
     def coefficients(self, target, frame, states, good, keys):
         points = frame.perturbed(states)
@@ -220,11 +221,11 @@ def _is_finite_row(x: Float[Array, "n ..."]) -> Bool[Array, " n"]:
 
 
 class CentredFrame(NamedTuple):
-    """Coordinates of `Quadratic`: states minus their `mean`, in these units, which are zero
-    for components that do not move."""
+    """Coordinates of `Quadratic`: states minus their `mean`, divided by these `scales`,
+    which are zero for components that do not move."""
 
     mean: Float[Array, " d"]
-    unit: Float[Array, " d"]
+    scales: Float[Array, " d"]
 
 
 class Quadratic(AbstractBasis):
@@ -232,7 +233,7 @@ class Quadratic(AbstractBasis):
     are the first and then the second derivatives, averaged over the pilot's states. For
     Gaussian states this is the least-squares fit, by Stein's lemma."""
 
-    kind: ClassVar[str] = "degree"
+    candidate_name: ClassVar[str] = "degree"
     d: int
     candidates: tuple[int, ...]
 
@@ -252,16 +253,16 @@ class Quadratic(AbstractBasis):
         # A Hessian costs as much as `d` gradients, and a gradient as much as two values.
         return 2 * self.d * self.num_pilots
 
-    def frame(self, states, good, unit):
-        return CentredFrame(equal_weights(good, states.dtype) @ states, unit)
+    def frame(self, states, good, scales):
+        return CentredFrame(equal_weights(good, states.dtype) @ states, scales)
 
     def coefficients(self, target, frame, states, good, keys):
         def derivatives(key_and_state):
-            """The first and second derivatives at a state, in units of the frame."""
+            """The first and second derivatives at a state, by its coordinates."""
             key, y = key_and_state
 
             def target_from_state(z):
-                return target(y + frame.unit * z, key)
+                return target(y + frame.scales * z, key)
 
             def gradient_twice(z):
                 gradient = jax.jacrev(target_from_state)(z)
@@ -286,7 +287,7 @@ class Quadratic(AbstractBasis):
         return jnp.where(order <= degrees, mean, 0)
 
     def value_at(self, frame, y, c):
-        z = (y - frame.mean) * inverse_or_zero(frame.unit)
+        z = (y - frame.mean) * inverse_or_zero(frame.scales)
         d = len(y)
         gradient = c[:d]
         hessian = c[d:].reshape(d, d, *c.shape[1:])

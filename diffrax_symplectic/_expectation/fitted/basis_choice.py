@@ -35,7 +35,7 @@ _LEAST_DEGREE_TRIED = 2
 _MOST_MEMORY = 4 * 2**30
 # The most entries of states that a fit computes without a warning that it will take long
 # (about a minute).
-_OUT_OF_PROPORTION = 2**31
+_MOST_WITHOUT_WARNING = 2**31
 
 
 class ChosenBasis(NamedTuple):
@@ -64,7 +64,7 @@ def chosen_basis(problem: Problem, degree: int | None) -> ChosenBasis:
 
 def warn_of_long_fit(chosen: ChosenBasis, stacklevel: int) -> None:
     """Warns if a fit takes long next to independent paths."""
-    if chosen.num_entries > _OUT_OF_PROPORTION:
+    if chosen.num_entries > _MOST_WITHOUT_WARNING:
         warnings.warn(
             f"The fit of `ValueFunctions` takes as long as {chosen.num_states:,} "
             "independent paths. If fewer paths are accurate enough, pass "
@@ -76,8 +76,9 @@ def warn_of_long_fit(chosen: ChosenBasis, stacklevel: int) -> None:
 def _basis(
     problem: Problem, degree: int | None, num_nodes: int, total_steps: int
 ) -> AbstractBasis:
-    """The basis for a noise with so many nodes in a step, and so many steps on all levels
-    together."""
+    """A grid if it fits into memory and time, or polynomials of several degrees to try; for
+    a given `degree`, polynomials of this degree. The noise has `num_nodes` in a step, and
+    all levels together have `total_steps`."""
     d = sum(leaf.size for leaf in jtu.tree_leaves(problem.y0))
     if degree is None:
         grid = _finest_grid(problem, d, num_nodes, total_steps)
@@ -86,8 +87,9 @@ def _basis(
         degrees = _candidate_degrees(d, num_nodes, total_steps)
     else:
         degrees = (whole_number("degree", degree, 0),)
-    # Averaged derivatives cost less than a fit to many polynomials.
-    if _has_many_of_degree_two(d) and max(degrees) <= 2:
+    # `Quadratic` averages derivatives in place of least squares, which would cost more with
+    # so many polynomials.
+    if _too_many_for_least_squares(d) and max(degrees) <= 2:
         return Quadratic(d, degrees)
     basis = Hermite(d, degrees)
     _check_memory(problem, basis)
@@ -116,7 +118,7 @@ def _finest_grid(
 def _candidate_degrees(d: int, num_nodes: int, total_steps: int) -> tuple[int, ...]:
     """The degrees to try: the highest that has few polynomials and does not take too long,
     and all even degrees below it."""
-    if _has_many_of_degree_two(d):
+    if _too_many_for_least_squares(d):
         return (1, 2)
 
     def is_allowed(degree: int) -> bool:
@@ -131,8 +133,8 @@ def _candidate_degrees(d: int, num_nodes: int, total_steps: int) -> tuple[int, .
     return (*lower_even, highest)
 
 
-def _has_many_of_degree_two(d: int) -> bool:
-    """Whether there are too many polynomials of degree 2 for a fit by least squares."""
+def _too_many_for_least_squares(d: int) -> bool:
+    """Whether there are too many polynomials up to degree 2 for a fit by least squares."""
     return num_polynomials(d, 2) > _MOST_POLYNOMIALS
 
 

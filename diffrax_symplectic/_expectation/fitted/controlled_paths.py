@@ -44,8 +44,8 @@ def controlled_paths(
     keys: Key[Array, " n"],
 ) -> Samples:
     """A sample is the value of a path minus its control variate, by `functions` with a
-    leading axis of levels. Deviations beyond the usual ones are averaged apart, which paths
-    with a wider `law` of the noise estimate."""
+    leading axis of levels. Deviations beyond the usual ones are averaged apart: trials in
+    which the noise has another `law` estimate them."""
     functions = functions.of_candidates(choice.best)
     starts = jax.vmap(problem.draw_start)(keys)
 
@@ -67,24 +67,28 @@ def controlled_paths(
                 return path_after, log_ratio
 
             states = paths.y, paths.solver_state, paths.args
-            after, log_ratio = jax.vmap(step_of_path)(*states, keys)
+            step_taken, log_ratio = jax.vmap(step_of_path)(*states, keys)
             # A failed path has no value, but its control must be finite.
             control_of_step = jnp.where(
-                mask_like(after.success, after.control), after.control, 0
+                mask_like(step_taken.success, step_taken.control), step_taken.control, 0
             )
-            before = paths.control
+            control_so_far = paths.control
             # The control of a step is the value after it minus the mean over the step. So
             # this is the mean over the first step of the functions after it.
             fitted_mean = jnp.where(
-                i == 0, after.value - control_of_step, before.fitted_mean
+                i == 0, step_taken.value - control_of_step, control_so_far.fitted_mean
             )
             control = _Control(
-                value=before.value + jnp.where(choice.used, control_of_step, 0),
+                value=control_so_far.value + jnp.where(choice.used, control_of_step, 0),
                 fitted_mean=fitted_mean,
-                log_ratio=before.log_ratio + log_ratio,
+                log_ratio=control_so_far.log_ratio + log_ratio,
             )
             return paths.after_step(
-                problem, after.y, after.solver_state, after.success, control
+                problem,
+                step_taken.y,
+                step_taken.solver_state,
+                step_taken.success,
+                control,
             )
 
         def first_solver_state(y, args):

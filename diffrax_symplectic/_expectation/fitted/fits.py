@@ -77,50 +77,58 @@ class FittedFunctions(eqx.Module):
 def fit(
     noise: Noise, key: PRNGKeyArray, basis: AbstractBasis
 ) -> tuple[FittedFunctions, Int[Array, ""]]:
-    """The functions of a level, by a pilot run forward in time and fits backward; and how
+    """The functions of a level, by a pilot run step_all in time and fits backward; and how
     many of the pilot's paths failed."""
     problem = noise.problem
     num_steps = noise.level.num_steps
-    pilot = _pilot(noise, jr.split(key, basis.num_pilots))
-    unit = _unit(problem, pilot, num_steps)
+    pilot = _run_pilot(noise, jr.split(key, basis.num_pilots))
+    scales = _scales(problem, pilot, num_steps)
 
     def frame_after(i: Any) -> PyTree[Array]:
-        return basis.frame(pilot.states[i], pilot.good, unit)
+        return basis.frame(pilot.states[i], pilot.good, scales)
 
-    def fit_step(num_fitted: Any, u: FittedFunctions) -> FittedFunctions:
+    def fit_step(num_fitted: Any, fitted: FittedFunctions) -> FittedFunctions:
         # The functions after later steps come first: those after a step are fitted to them.
         i = num_steps - 1 - num_fitted
         frame = frame_after(i)
-        target = _target(noise, u, i)
-        c = basis.coefficients(target, frame, pilot.states[i], pilot.good, pilot.keys)
+        target = _target(noise, fitted, i)
+        coefficients = basis.coefficients(
+            target, frame, pilot.states[i], pilot.good, pilot.keys
+        )
         put_step = lambda of_steps, of_step: of_steps.at[i].set(of_step)
-        frames = jtu.tree_map(put_step, u.frames, frame)
-        return FittedFunctions(frames, put_step(u.coefficients, c), None, basis)
+        return FittedFunctions(
+            frames=jtu.tree_map(put_step, fitted.frames, frame),
+            coefficients=put_step(fitted.coefficients, coefficients),
+            second_derivatives=None,
+            basis=basis,
+        )
 
     # All levels have arrays for the steps of the finest one, so that they share a program.
-    def zeros(struct: jax.ShapeDtypeStruct) -> Array:
-        return jnp.zeros((problem.finest_steps, *struct.shape), struct.dtype)
+    def zeros_for_all_steps(of_step: jax.ShapeDtypeStruct) -> Array:
+        return jnp.zeros((problem.finest_steps, *of_step.shape), of_step.dtype)
 
-    frames = jtu.tree_map(zeros, jax.eval_shape(lambda: frame_after(0)))
-    shape = (
-        problem.finest_steps,
-        basis.size,
-        len(basis.candidates),
-        *problem.output_shape,
+    shape = (basis.size, len(basis.candidates), *problem.output_shape)
+    struct_of_frame = jax.eval_shape(lambda: frame_after(0))
+    struct_of_coefficients = jax.ShapeDtypeStruct(shape, problem.dtype)
+    unfitted = FittedFunctions(
+        frames=jtu.tree_map(zeros_for_all_steps, struct_of_frame),
+        coefficients=zeros_for_all_steps(struct_of_coefficients),
+        second_derivatives=None,
+        basis=basis,
     )
-    u = FittedFunctions(frames, jnp.zeros(shape, problem.dtype), None, basis)
-    u = lax.fori_loop(0, num_steps, fit_step, u)
+    fitted = lax.fori_loop(0, num_steps, fit_step, unfitted)
+    # No fit reads second derivatives, so they are computed once, at the end.
     functions = FittedFunctions(
-        frames=u.frames,
-        coefficients=u.coefficients,
-        second_derivatives=_second_derivatives(noise, pilot, u),
+        frames=fitted.frames,
+        coefficients=fitted.coefficients,
+        second_derivatives=_second_derivatives(noise, pilot, fitted),
         basis=basis,
     )
     num_failed = jnp.sum(~pilot.good)
     return functions, num_failed
 
 
-def _target(noise: Noise, u: FittedFunctions, i: Any) -> Target:
+def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
     """What the functions after step `i` are fitted to, as a function of a flat state. For
     averages at the end of this step that is `phi` itself, for later ones the mean over the
     next step of the functions after it, which are known, and for earlier ones zero. A
@@ -138,7 +146,7 @@ def _target(noise: Noise, u: FittedFunctions, i: Any) -> Target:
         if key is not None:
             # The pilot's own steps draw by the indices below `finest_steps`.
             x, _ = noise.draw(key, problem.finest_steps + i)
-        mean = noise.mean(next_step, y, lambda y1: u(next_step, y1), x)
+        mean = noise.mean(next_step, y, lambda y1: fitted(next_step, y1), x)
         phi = problem.values(problem.t0 + (i + 1) * level.h, y).astype(mean.dtype)
         # Which of the times at which to average are the end of this step, or later.
         is_end_of_step = level.saved_steps == i + 1
@@ -150,7 +158,7 @@ def _target(noise: Noise, u: FittedFunctions, i: Any) -> Target:
 
 
 def _second_derivatives(
-    noise: Noise, pilot: "_Pilot", u: FittedFunctions
+    noise: Noise, pilot: "_Pilot", fitted: FittedFunctions
 ) -> Float[Array, "steps n n C S m"] | None:
     """Second derivatives of the functions after each step along its noise, averaged over
     some of the pilot's states before the step; `None` if they are not needed."""
@@ -158,8 +166,10 @@ def _second_derivatives(
 
     def mean_of_step(step_and_states):
         i, states = step_and_states
-        u_after_step = lambda y1: u(i, y1)
-        return noise.mean_second_derivatives(i, jax.vmap(unravel)(states), u_after_step)
+        value_after_step = lambda y1: fitted(i, y1)
+        return noise.mean_second_derivatives(
+            i, jax.vmap(unravel)(states), value_after_step
+        )
 
     # The states before each step are those after the step before: (steps, paths, d).
     states_before = jnp.concatenate([pilot.starts[None], pilot.states[:-1]])
@@ -183,11 +193,11 @@ class _Pilot(NamedTuple):
     good: Bool[Array, " paths"]
 
 
-def _pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
+def _run_pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
     """Simulates a path for each key."""
     problem = noise.problem
 
-    def step(
+    def step_one(
         i: Any, y: Y, args: PyTree[Array], key: PRNGKeyArray
     ) -> tuple[Y, Bool[Array, ""]]:
         # With equal probabilities of all outcomes the pilot's paths spread further than
@@ -198,10 +208,10 @@ def _pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
         y, _, success = noise_of_path.step(i, y, solver_state, x)
         return y, success
 
-    def forward(i: Any, carry: tuple[PathStates, Array]) -> tuple[PathStates, Array]:
+    def step_all(i: Any, carry: tuple[PathStates, Array]) -> tuple[PathStates, Array]:
         paths, states = carry
-        step_of_all = jax.vmap(ft.partial(step, i))
-        y, success = step_of_all(paths.y, paths.args, keys)
+        vectorized_step = jax.vmap(ft.partial(step_one, i))
+        y, success = vectorized_step(paths.y, paths.args, keys)
         paths = paths.after_step(problem, y, None, success)
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
@@ -212,11 +222,11 @@ def _pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
     starts = jax.vmap(ravel)(paths.y)
     states = jnp.broadcast_to(starts, (problem.finest_steps, *starts.shape))
     carry = paths, states
-    paths, states = lax.fori_loop(0, noise.level.num_steps, forward, carry)
+    paths, states = lax.fori_loop(0, noise.level.num_steps, step_all, carry)
     return _Pilot(keys, starts, states, ~paths.failed)
 
 
-def _unit(problem: Problem, pilot: _Pilot, num_steps: Any) -> Float[Array, " d"]:
+def _scales(problem: Problem, pilot: _Pilot, num_steps: Any) -> Float[Array, " d"]:
     """How far each component moves: the root of the mean squared distance from the start
     over all steps of good paths. Zero for components that do not move."""
     start, _ = jfu.ravel_pytree(problem.y0)

@@ -124,7 +124,7 @@ class Grid(AbstractBasis):
     along an axis. The correction falls to zero towards the edge of the grid; beyond it only
     the polynomial remains, whose degree is the one that fits best near the edge."""
 
-    kind: ClassVar[str] = "grid points along an axis"
+    candidate_name: ClassVar[str] = "grid points along an axis"
     d: int
     candidates: tuple[int]
 
@@ -145,8 +145,8 @@ class Grid(AbstractBasis):
         """The polynomials that the grid corrects."""
         return Hermite(self.d, _DEGREES)
 
-    def frame(self, states, good, unit):
-        inner = CovarianceFrame.of(states, good, unit)
+    def frame(self, states, good, scales):
+        inner = CovarianceFrame.of(states, good, scales)
         return StretchedFrame.of(
             inner, inner.coordinates(states), good, self._base.num_pilots
         )
@@ -163,6 +163,7 @@ class Grid(AbstractBasis):
         values = jax.vmap(target)(jnp.concatenate([pilots, nodes]))
         # One copy of the values for each degree: (pilots, degrees, S, m).
         values_at_pilots = jnp.repeat(values[:num_pilots], len(_DEGREES), axis=1)
+        # (size of the base, degrees, S, m)
         c = base.least_squares_fit(
             values_at_pilots, frame.inner, pilots, good[:num_pilots]
         )
@@ -172,13 +173,11 @@ class Grid(AbstractBasis):
         # The target may overflow where it grows fast.
         residual = jnp.where(jnp.isfinite(residual), residual, 0)
         best_degree = _best_degree_near_edge(x, residual)
-        residual = jnp.take_along_axis(residual, best_degree, 1)
-        c = jnp.take_along_axis(c, best_degree, 1)
-        # From 0, where the correction starts to fall, to 1 at the edge.
-        progress_of_fall = (np.abs(x) - _START_OF_FALL) / (1 - _START_OF_FALL)
-        factor = np.prod(_smooth_fall(progress_of_fall), axis=1)
-        factor = jnp.asarray(factor, residual.dtype)[:, None, None, None]
-        return jnp.concatenate([c, residual * factor])
+        c_of_best = jnp.take_along_axis(c, best_degree, 1)
+        residual_of_best = jnp.take_along_axis(residual, best_degree, 1)
+        factor = jnp.asarray(_factor_near_edge(x), residual.dtype)
+        correction = residual_of_best * factor[:, None, None, None]
+        return jnp.concatenate([c_of_best, correction])
 
     def value_at(self, frame, y, c):
         size = self._base.size
@@ -223,6 +222,14 @@ def _best_degree_near_edge(
     is_near_edge = is_beyond_middle & (distance < _START_OF_FALL)
     largest_residual = jnp.max(jnp.abs(residual[is_near_edge]), axis=0)
     return jnp.argmin(largest_residual, axis=0)[None, None]
+
+
+def _factor_near_edge(x: Float[np.ndarray, "nodes d"]) -> Float[np.ndarray, " nodes"]:
+    """The factor of the correction at the nodes with these coordinates: one in the middle
+    of the grid, and zero at its edge."""
+    # From 0, where the correction starts to fall, to 1 at the edge, along each axis.
+    progress_of_fall = (np.abs(x) - _START_OF_FALL) / (1 - _START_OF_FALL)
+    return np.prod(_smooth_fall(progress_of_fall), axis=1)
 
 
 def _lagrange_polynomials(

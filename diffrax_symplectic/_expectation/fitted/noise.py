@@ -1,6 +1,7 @@
 """The random variables of a step, and expectations over them."""
 
 import dataclasses
+import functools as ft
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
@@ -88,7 +89,8 @@ class Noise(eqx.Module):
         num_outcomes = math.prod(len(law.values) for law in discrete_laws)
         if num_outcomes > _MOST_OUTCOMES:
             return Noise(problem, level, discrete_laws, outcomes=None)
-        values, probabilities = outcomes(discrete_laws, 1)
+        # Only Gaussian variables have nodes, of which there are none here.
+        values, probabilities = outcomes(discrete_laws, num_nodes=1)
         few_outcomes = WeightedNodes(values.astype(problem.dtype), probabilities)
         return Noise(problem, level, discrete_laws, few_outcomes)
 
@@ -112,18 +114,19 @@ class Noise(eqx.Module):
         # One random word for each variable, from a single block of words.
         words = random_words(key, place, 1, len(self.laws))[0]
         x = jnp.zeros(len(self.laws), self.problem.dtype)
-        log_ratio = jnp.zeros_like(x)
+        log_ratios = jnp.zeros_like(x)
         tilts = jnp.broadcast_to(tilt, x.shape)
         # Outcomes are drawn once for each different law, rather than for each variable:
         # hundreds of variables have one law or two.
         for law in dict.fromkeys(self.laws):
             has_law = np.array([other == law for other in self.laws])
-            outcomes_of_law, log_ratio_of_law = _draw_outcomes(
+            # As if all variables had this law.
+            x_by_law, log_ratios_by_law = _draw_outcomes(
                 law, words, share, tilts, x.dtype
             )
-            x = jnp.where(has_law, outcomes_of_law, x)
-            log_ratio = jnp.where(has_law, log_ratio_of_law, log_ratio)
-        return x, jnp.sum(log_ratio)
+            x = jnp.where(has_law, x_by_law, x)
+            log_ratios = jnp.where(has_law, log_ratios_by_law, log_ratios)
+        return x, jnp.sum(log_ratios)
 
     def weighted_nodes(self, x: Array | None = None) -> WeightedNodes:
         """Nodes and weights of the expectation over the variables: all outcomes and their
@@ -135,7 +138,7 @@ class Noise(eqx.Module):
             # The mean over a draw and its opposite is right for all odd functions.
             return WeightedNodes(jnp.stack([x, -x]), np.full(2, 0.5))
         # Two nodes along each axis, at `sqrt(3)` standard deviations with weight 1/6, as in
-        # Gauss-Hermite quadrature, and zero, with what is left of a total weight of one.
+        # Gauss-Hermite quadrature, and zero, with the remainder of a total weight of one.
         # They are exact for polynomials of degree 3, or 5 in one variable.
         n = len(self.laws)
         nodes_on_axes = np.diag(np.sqrt(3 * self._variances()))
@@ -208,7 +211,7 @@ class Noise(eqx.Module):
             end, _, _ = self.step(i, y, solver_state, x)
             return u(end)
 
-        first_derivatives = jax.jacrev(u_after)(0 * x)
+        first_derivatives = jax.jacrev(u_after)(jnp.zeros_like(x))
         # The second derivatives `C`, multiplied by this matrix and summed over both axes,
         # are `x^T C x - tr(C Sigma)`.
         centred_square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
@@ -286,21 +289,22 @@ def _draw_outcomes(
     """Outcomes of variables with one law, widened and tilted, and their log likelihood
     ratios, from one random word each."""
     own_probabilities = np.array(law.probabilities, dtype)
-    wider = widened_probabilities(law, share)
+    widened = widened_probabilities(law, share)
     # (variables, outcomes)
-    probabilities = jax.vmap(lambda tilt: tilted_probabilities(law, wider, tilt))(tilts)
+    probabilities = jax.vmap(ft.partial(tilted_probabilities, law, widened))(tilts)
     # A variable has the outcome whose index is the number of cuts that are not above its
     # word. The law as it is has cuts in integers, by which a `WeakBrownianPath` draws, too.
     # With other cuts, by rounded probabilities, few draws would differ, but the law would
     # not be exact.
     is_unchanged = (share == 0) & (tilts == 0)
+    # Words are whole numbers from 0 to `2**32 - 1`.
     cuts = (jnp.cumsum(probabilities, axis=1)[:, :-1] * 2.0**32).astype(jnp.uint32)
     cuts = jnp.where(is_unchanged[:, None], np.array(law.cuts, np.uint32), cuts)
-    index = jnp.sum(words[:, None] >= cuts, axis=1)
-    outcome = jnp.asarray(law.values, dtype)[index]
-    log_ratio_of_outcomes = jnp.log(probabilities / own_probabilities)
-    log_ratio = jnp.take_along_axis(log_ratio_of_outcomes, index[:, None], axis=1)
-    return outcome, log_ratio[:, 0]
+    indices = jnp.sum(words[:, None] >= cuts, axis=1)
+    drawn = jnp.asarray(law.values, dtype)[indices]
+    log_ratios_of_outcomes = jnp.log(probabilities / own_probabilities)
+    log_ratios = jnp.take_along_axis(log_ratios_of_outcomes, indices[:, None], axis=1)
+    return drawn, log_ratios[:, 0]
 
 
 def widened_probabilities(law: Discrete, share: Any) -> Any:

@@ -56,11 +56,12 @@ def laws_of_trials(problem: Problem) -> list[TrialLaw]:
     laws = Noise.of(problem, problem.level(0)).laws
     no_share = np.zeros(len(problem.levels.h), problem.dtype)
     no_tilts = np.zeros((len(no_share), len(laws)), problem.dtype)
-    share = _strongest_change(problem, laws, widened_probabilities, 1.0)
+    # With the share 1 all outcomes are equally probable.
+    share = _strongest_change(problem, laws, widened_probabilities, most=1.0)
     trial_laws = [TrialLaw(no_share, no_tilts), TrialLaw(share, no_tilts)]
     num_noises = number_of_noises(problem.terms)
     if num_noises <= _MOST_NOISES:
-        tilt = _strongest_change(problem, laws, _with_own_tilted, _MOST_TILTED)
+        tilt = _strongest_change(problem, laws, _with_own_tilted, most=_MOST_TILTED)
         for sides in itertools.product((-1, 1), repeat=num_noises):
             tilts = no_tilts.copy()
             # The increments come first. The other variables, which are only in products
@@ -78,11 +79,11 @@ def _with_own_tilted(law: Discrete, tilt: float) -> np.ndarray:
 def _strongest_change(
     problem: Problem,
     laws: tuple[Discrete, ...],
-    probabilities_after: _ChangeOfLaw,
+    changed_probabilities: _ChangeOfLaw,
     most: float,
 ) -> Float[np.ndarray, " levels"]:
     """For each level the largest strength, up to `most`, for which the probabilities
-    `probabilities_after(law, strength)` give all variables of a path, on all levels
+    `changed_probabilities(law, strength)` give all variables of a path, on all levels
     together, a relative entropy of at most 8 nats with respect to their own laws. (The
     relative entropy grows with the strength.)"""
     num_steps = problem.levels.num_steps
@@ -95,7 +96,10 @@ def _strongest_change(
     for _ in range(_HALVINGS):
         middle = (lower + upper) / 2
         nats_of_step = np.array(
-            [_relative_entropy(law_counts, probabilities_after, z) for z in middle]
+            [
+                _relative_entropy(law_counts, changed_probabilities, strength)
+                for strength in middle
+            ]
         )
         is_too_much = num_steps * nats_of_step > most_nats
         lower = np.where(is_too_much, lower, middle)
@@ -105,17 +109,17 @@ def _strongest_change(
 
 def _relative_entropy(
     law_counts: collections.Counter[Discrete],
-    probabilities_after: _ChangeOfLaw,
+    changed_probabilities: _ChangeOfLaw,
     strength: float,
 ) -> float:
     """The relative entropy of the variables of a step, so many of each law, after a change
-    of this strength: the sum of `after * log(after / before)` over the probabilities of all
-    outcomes, in nats."""
+    of this strength: the sum of `changed * log(changed / own)` over the probabilities of
+    all outcomes, in nats."""
     nats = 0.0
     for law, count in law_counts.items():
-        before = np.array(law.probabilities)
-        after = probabilities_after(law, strength)
-        nats += count * np.sum(after * np.log(after / before))
+        own = np.array(law.probabilities)
+        changed = changed_probabilities(law, strength)
+        nats += count * np.sum(changed * np.log(changed / own))
     return nats
 
 

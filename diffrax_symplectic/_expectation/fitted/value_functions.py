@@ -42,9 +42,11 @@ from .tails import largest_tails, laws_of_trials, TrialLaw, UsualDeviations
 # Folded into the key of a call to draw trials. (Numbers of levels, which are folded into it
 # to draw fits, are smaller.)
 _TRIAL_KEY = 0xFFFFFFFE
-# A trial with wider noise has this many batches, more than the trial of one batch beyond
-# whose deviations it looks.
-_BATCHES_OF_WIDE_TRIAL = 2
+# From the code that calls `expectation` to `prepare`, counted as for `warnings.warn`.
+_FRAMES_TO_USER = 5
+# A trial of the tails has this many batches, more than the trial of one batch beyond whose
+# deviations it looks.
+_BATCHES_OF_TAIL_TRIAL = 2
 
 
 @saved_by_name
@@ -92,7 +94,7 @@ class ValueFunctions(AbstractSampling):
 
     def prepare(self, problem, key, devices):
         chosen = chosen_basis(problem, self.degree)
-        warn_of_long_fit(chosen, stacklevel=5)
+        warn_of_long_fit(chosen, stacklevel=_FRAMES_TO_USER)
         basis = chosen.basis
         struct = problem.sample_struct
         controlled = _ControlledSampling(
@@ -104,7 +106,7 @@ class ValueFunctions(AbstractSampling):
             devices=devices,
             batch_size=self.batch_size,
         )
-        own_law, *wider_laws = laws_of_trials(problem)
+        own_law, *other_laws = laws_of_trials(problem)
         # One trial for each candidate, on the same paths.
         trials_of_candidates = [
             controlled.trial_of_candidate(candidate, own_law)
@@ -116,22 +118,22 @@ class ValueFunctions(AbstractSampling):
             warnings.warn(
                 f"`degree={self.degree}` is no better than no control variate, so none is "
                 "used. Pass another `degree`, or another `sampling`.",
-                stacklevel=5,
+                stacklevel=_FRAMES_TO_USER,
             )
-        # Paths with wider noise estimate the deviations beyond the largest in these trials.
+        # Trials with stronger noise estimate the deviations beyond the largest in these.
         usual_deviations = _usual_deviations(
             trials_of_candidates, choice, problem.output_shape, problem.dtype
         )
-        wide_trials = [
+        tail_trials = [
             controlled.trial(
-                choice, usual_deviations, law, _BATCHES_OF_WIDE_TRIAL * self.batch_size
+                choice, usual_deviations, law, _BATCHES_OF_TAIL_TRIAL * self.batch_size
             )
-            for law in wider_laws
+            for law in other_laws
         ]
         plan = controlled.plan(choice, usual_deviations, own_law, self.num_paths)
         return plan._replace(
             reason=_reason(basis, choice),
-            tails=largest_tails(wide_trials),
+            tails=largest_tails(tail_trials),
             remainder=comparison.remainder(problem.dtype),
         )
 
@@ -233,7 +235,7 @@ class _Comparison(NamedTuple):
     mean: Float[np.ndarray, "S m"]
 
     def remainder(self, dtype: Any) -> float:
-        """The largest fraction of a standard error that is left with control."""
+        """The largest fraction of a standard error that remains with control."""
         # Where nothing is random, as for a constant `phi`, both errors are rounding errors.
         rounding = ROUNDING * jnp.finfo(dtype).eps * np.abs(self.mean)
         is_random = self.plain_errors > rounding
@@ -258,9 +260,9 @@ def _comparison(
     results = combined_results(first, Combination.BEST)
     plain_errors = _as_one_array(results.plain_std_error, output_shape)
     # A fit is used where the error without it is NaN, too.
-    is_worse = least_errors >= plain_errors
+    is_no_better = least_errors >= plain_errors
     return _Comparison(
-        choice=Choice(best=np.argmin(errors, axis=0), used=~is_worse),
+        choice=Choice(best=np.argmin(errors, axis=0), used=~is_no_better),
         least_errors=least_errors,
         plain_errors=plain_errors,
         mean=_as_one_array(first.mean, output_shape),
@@ -302,7 +304,7 @@ def _reason(basis: AbstractBasis, choice: Choice) -> str:
     options = np.array([0, *basis.candidates])
     chosen = np.unique(options[np.where(choice.used, choice.best + 1, 0)])
     return (
-        f"{basis.kind}: {', '.join(map(str, chosen))}, chosen among "
+        f"{basis.candidate_name}: {', '.join(map(str, chosen))}, chosen among "
         f"{', '.join(map(str, np.unique(options)))}"
     )
 

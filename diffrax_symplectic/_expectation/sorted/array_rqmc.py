@@ -34,7 +34,7 @@ from ..._simulation import (
     real_vector,
     simulate,
 )
-from ..._terms import brownian_paths, path_numbers, replace_paths
+from ..._terms import brownian_paths, motion_numbers, replace_paths
 from ..estimate import heaviness
 from ..sampling import (
     AbstractSampling,
@@ -275,9 +275,9 @@ def word_layout(terms: PyTree[diffrax.AbstractTerm]) -> WordLayout:
     first_words: dict[int, int] = {}
     slices: list[tuple[int, int]] = []
     num_words = 0
-    for path_number, path in zip(path_numbers(paths), paths):
+    for motion_number, path in zip(motion_numbers(paths), paths):
         # A Brownian motion that was met before keeps its words; a new one takes the next.
-        start = first_words.setdefault(path_number, num_words)
+        start = first_words.setdefault(motion_number, num_words)
         end = start + path.num_words(use_levy=True)
         slices.append((start, end))
         num_words = max(num_words, end)

@@ -20,7 +20,7 @@ from ..constrained_drift import constraint_of, without_constraint
 from ..dependence import Dependence
 from ..langevin import split_friction
 from ..structure import separable_fault
-from ..vector_fields import check_fit
+from ..vector_fields import check_terms_fit_state
 from .multipliers import Vector
 from .surface import Surface
 
@@ -145,7 +145,7 @@ def constrained_state(
     check_state(y0, "constrained_state")
     t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(y0)))
     drift, _, _ = split_friction(without_constraint(terms))
-    check_fit(diffrax.MultiTerm(*drift), t, y0, args)
+    check_terms_fit_state(diffrax.MultiTerm(*drift), t, y0, args)
     if fault := separable_fault(drift, (), t, y0, args):
         raise ValueError(
             "Constrained terms need H0 = p . M^-1 p / 2 + U(t, q), but "

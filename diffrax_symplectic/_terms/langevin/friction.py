@@ -330,16 +330,18 @@ def checked_friction(
         )
     if path_struct is None:
         # The shapes of the momenta are known in the solve only.
-        return jtu.tree_map(lambda value: _checked_array(value, None), friction)
+        return jtu.tree_map(
+            lambda value: _checked_friction_of_array(value, None), friction
+        )
     if jtu.all_leaves([friction]):
         # One friction for all arrays of momenta, whose shape is known if they share it.
         path_shapes = {leaf.shape for leaf in jtu.tree_leaves(path_struct)}
         momenta_shape = path_shapes.pop() if len(path_shapes) == 1 else None
-        return _checked_array(friction, momenta_shape)
+        return _checked_friction_of_array(friction, momenta_shape)
     # The path has the shapes of the momenta.
     friction_of_each = _value_for_each("friction", friction, path_struct)
     return jtu.tree_map(
-        lambda value, leaf: _checked_array(value, leaf.shape),
+        lambda value, leaf: _checked_friction_of_array(value, leaf.shape),
         friction_of_each,
         path_struct,
     )
@@ -349,30 +351,39 @@ def _as_array_or_function(x: Any) -> Any:
     return x if callable(x) else jnp.asarray(x)
 
 
-def _checked_array(
+def _checked_friction_of_array(
     friction: ArrayLike, momenta_shape: tuple[int, ...] | None
 ) -> Array | _MatrixOrNumbers:
     """The friction of an array of momenta, whose shape is that of their path, or `None` if
     it is not known. Raises a `ValueError` if the friction is known to be invalid."""
-    shape = jnp.shape(friction)
-    # A matrix has the shape of its momenta twice.
-    half = shape[: len(shape) // 2]
-    may_be_matrix = len(half) > 0 and shape == half * 2
-    is_matrix = False
+    must_be_matrix = False
     if momenta_shape is not None:
         _check_fits_path(friction, momenta_shape)
-        is_matrix = _is_matrix(friction, momenta_shape)
-    if not may_be_matrix:
-        return jnp.asarray(
-            checked_not_negative("friction", friction, expected=_EXPECTED)
-        )
+        must_be_matrix = _is_matrix(friction, momenta_shape)
+    if _has_shape_of_matrix(friction):
+        return _checked_matrix_or_numbers(friction, must_be_matrix)
+    return jnp.asarray(checked_not_negative("friction", friction, expected=_EXPECTED))
+
+
+def _has_shape_of_matrix(friction: ArrayLike) -> bool:
+    """Whether an array may be a matrix, which has the shape of its momenta twice."""
+    shape = jnp.shape(friction)
+    half = shape[: len(shape) // 2]
+    return len(half) > 0 and shape == half * 2
+
+
+def _checked_matrix_or_numbers(
+    friction: ArrayLike, must_be_matrix: bool
+) -> _MatrixOrNumbers:
+    """The friction with its root as a matrix. Raises a `ValueError` if its values are known
+    to be invalid: for a matrix, or if it need not be one, for numbers, too."""
     root = semidefinite_root(jnp.asarray(friction, jnp.result_type(friction, float)))
     is_semidefinite = ~jnp.any(jnp.isnan(root))
     matrix_or_numbers = _MatrixOrNumbers(jnp.asarray(friction), is_semidefinite, root)
     if is_traced(is_semidefinite):
         return matrix_or_numbers
     # Without the shape of the momenta the array may be valid as numbers.
-    may_be_numbers = not is_matrix and bool(np.all(np.asarray(friction) >= 0))
+    may_be_numbers = not must_be_matrix and bool(np.all(np.asarray(friction) >= 0))
     if not is_semidefinite and not may_be_numbers:
         raise ValueError(
             "`friction` must be a symmetric positive semidefinite matrix, or an array of "
@@ -408,29 +419,31 @@ def semidefinite_root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
     diagonal = jnp.diag(square)
     # The error of a pivot, which is a difference of numbers up to the diagonal entry.
     rounding = 10 * n * eps * diagonal
-    # If the matrix is semidefinite, no entry that is left at the end, when only tiny pivots
-    # remain, is larger than this.
+    # If the matrix is semidefinite, no entry of the remainder at the end, when all pivots
+    # are tiny, is larger than this.
     size = jnp.sqrt(jnp.maximum(diagonal, 0))
-    largest_left = 10 * (n * eps) ** 0.5 * size[:, None] * size
+    largest_remainder = 10 * (n * eps) ** 0.5 * size[:, None] * size
 
     def with_column(j: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        """What is left of the matrix without column `j` of the root, the root with this
+        """The remainder of the matrix after column `j` of the root, the root with this
         column, and whether the matrix may still be semidefinite."""
-        left, root, is_valid = carry
-        pivot = left[j, j]
+        remainder, root, is_valid = carry
+        pivot = remainder[j, j]
         is_used = pivot > rounding[j]
-        entries = left[:, j] / jnp.sqrt(jnp.where(is_used, pivot, 1))
+        entries = remainder[:, j] / jnp.sqrt(jnp.where(is_used, pivot, 1))
         entries = jnp.where(is_used & (jnp.arange(n) >= j), entries, 0)
-        left = left - entries[:, None] * entries
+        remainder = remainder - entries[:, None] * entries
         is_valid = is_valid & (pivot >= -rounding[j])
-        return left, root.at[:, j].set(entries), is_valid
+        return remainder, root.at[:, j].set(entries), is_valid
 
     is_valid = _is_symmetric(square) & jnp.all(jnp.isfinite(square))
-    begin = (square, jnp.zeros_like(square), is_valid)
+    # The remainder, the root and whether the matrix may be semidefinite, before any column.
+    carry = (square, jnp.zeros_like(square), is_valid)
     # The loop is unrolled for all matrices that the fused engine solves with: the engine
     # takes no column whose number is known only when it runs.
-    left, root, is_valid = jax.lax.fori_loop(0, n, with_column, begin, unroll=n <= 16)
-    is_valid = is_valid & jnp.all(jnp.abs(left) <= largest_left)
+    carry = jax.lax.fori_loop(0, n, with_column, carry, unroll=n <= 16)
+    remainder, root, is_valid = carry
+    is_valid = is_valid & jnp.all(jnp.abs(remainder) <= largest_remainder)
     return jnp.where(is_valid, root, jnp.nan).reshape(matrix.shape)
 
 

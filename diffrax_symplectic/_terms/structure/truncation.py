@@ -11,7 +11,7 @@ from ..._compat import unwrapped
 from ..._custom_types import Args, RealScalarLike, Y
 from ..drift_and_noise import flattened
 from ..langevin import BathNoise
-from ..paths import brownian_paths, path_numbers, replace_paths
+from ..paths import brownian_paths, motion_numbers, replace_paths
 from .checks import additive_fault
 
 
@@ -33,7 +33,7 @@ def which_need_truncation(
         depends = not is_bath and additive_fault((term,), t0, y0, args) is not None
         depends_on_state += [depends] * len(brownian_paths(term))
     # Equal paths are one Brownian motion, which has one law.
-    numbers = path_numbers(brownian_paths(terms))
+    numbers = motion_numbers(brownian_paths(terms))
     flags = zip(numbers, depends_on_state)
     truncated_numbers = {number for number, depends in flags if depends}
     return tuple(number in truncated_numbers for number in numbers)
