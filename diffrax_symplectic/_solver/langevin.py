@@ -154,8 +154,8 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
             variables = drawn_variables(noise, ["W"], t0, t1, type(self).__name__)
             noise_change, _ = apply(noise, variables["W"], args, middle, (p, q))
         p = after_friction(friction, middle, h, (p, q), args, noise_change)
-        # Flow. Velocities of free flight do not depend on time. Taken at `t1`, the time of the
-        # forces below, they share with these what depends on time alone.
+        # Flow. Velocities of free flight do not depend on time. Taken at `t1`, the time of
+        # the forces below, they share with these what depends on time alone.
         start = t1 if self.flow is None else middle
         (p, q), flow_state, flow_result = follow(
             start, t1, half, (p, q), args, flow_state
