@@ -116,6 +116,27 @@ def test_the_checks_are_functions_of_the_package():
     assert CHECKS <= {node.name for node in nodes if isinstance(node, ast.FunctionDef)}
 
 
+def listed_arguments(fn) -> set[str]:
+    """The names in the list of arguments of a docstring."""
+    found = re.search(
+        r"\*\*Arguments:\*\*\n\n(.*?)(\n\n\*\*|\Z)", inspect.getdoc(fn) or "", re.S
+    )
+    items = re.findall(r"^- ((?:`\w+`(?:, )?)+)", found[1], re.M) if found else []
+    return {name for item in items for name in re.findall(r"\w+", item)}
+
+
+def test_docstrings_list_all_arguments_and_no_others():
+    with_lists = 0
+    for fn in public_functions():
+        listed = listed_arguments(fn)
+        if inspect.isclass(fn):
+            listed |= listed_arguments(fn.__init__)
+        if listed:
+            assert listed == parameters(fn) - {"self"}, fn
+            with_lists += 1
+    assert with_lists > 30
+
+
 def test_fields_of_results_are_no_arguments():
     assert "num_stragglers" not in known_names() and "num_paths" in known_names()
 

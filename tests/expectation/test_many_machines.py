@@ -126,6 +126,19 @@ def test_an_estimate_by_an_unknown_sampling_is_refused_by_name(tmp_path):
         ds.Expectation.load(tmp_path / "own.npz")
 
 
+def test_a_sampling_whose_fields_were_renamed_is_refused_by_name(tmp_path):
+    class IndependentPaths(AbstractSampling):
+        old_name: int = 3
+
+        def prepare(self, problem, key, devices): ...
+
+    estimate = ds.monte_carlo(jr.normal, key=KEY, num_paths=8)
+    renamed = dataclasses.replace(estimate, sampling=IndependentPaths())
+    renamed.save(tmp_path / "old.npz")
+    with pytest.raises(ValueError, match="`IndependentPaths` with old_name, which"):
+        ds.Expectation.load(tmp_path / "old.npz")
+
+
 PROGRAM = """
 import os, signal, sys
 import jax

@@ -1,5 +1,6 @@
 """Estimates in files: arrays, and their structure as JSON."""
 
+import dataclasses
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -105,7 +106,8 @@ def fields_from(
 
 
 def _sampling_from(header: dict[str, Any]) -> Any:
-    """The sampling, without the functions that it may have had."""
+    """The sampling, without the functions that it may have had. Raises a `ValueError` if
+    this version does not have it, or not all of its fields."""
     name = header["sampling"]
     if name is None:
         return None
@@ -114,7 +116,15 @@ def _sampling_from(header: dict[str, Any]) -> Any:
             f"The estimate was sampled by `{name}`, which this version does not have. Read "
             "it with the version that wrote it."
         )
-    return SAVED_SAMPLINGS[name](**header["fields"])
+    sampling = SAVED_SAMPLINGS[name]
+    own_names = {field.name for field in dataclasses.fields(sampling)}
+    unknown_names = sorted(header["fields"].keys() - own_names)
+    if unknown_names:
+        raise ValueError(
+            f"The estimate was sampled by `{name}` with {', '.join(unknown_names)}, which "
+            "this version does not have. Read it with the version that wrote it."
+        )
+    return sampling(**header["fields"])
 
 
 def _is_plain(x: Any) -> bool:
