@@ -185,7 +185,7 @@ def shapes(tree: PyTree) -> str:
     return eqx.tree_pformat(jax.eval_shape(lambda: tree), struct_as_array=True)
 
 
-def check_state(y0: Y, caller: str) -> None:
+def check_state(caller: str, y0: Y) -> None:
     """Raises a `ValueError` unless the state consists of real floating-point arrays, in
     one precision of at least 32 bits. `caller` is the name of the solver or function that
     the state was passed to."""

@@ -173,16 +173,17 @@ def is_adjoint_term(term: diffrax.AbstractTerm) -> bool:
 
 
 def with_captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[Any]]:
-    """`fn(value)` as a function of `value` and of the arrays that `fn` captures; and these.
+    """Returns a function `call(value, arrays)` for `fn(value)`, which takes the arrays that
+    `fn` captures as an argument; and these arrays.
     (`eqx.filter_closure_convert` would refuse them under `shard_map`, which changes the
     types that it checks.)"""
     traced, struct = jax.make_jaxpr(fn, return_shape=True)(value)
-    treedef = jtu.tree_structure(struct)
+    result_treedef = jtu.tree_structure(struct)
 
     def call(value: PyTree, arrays: list[Any]) -> PyTree:
         # A jaxpr is a function of its inputs and constants, both as flat lists.
         run = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, arrays))
-        return treedef.unflatten(run(*jtu.tree_leaves(value)))
+        return result_treedef.unflatten(run(*jtu.tree_leaves(value)))
 
     return call, traced.consts
 

@@ -178,7 +178,7 @@ def suggest_solver(
     given_terms = with_paths_for_shapes(terms, WeakBrownianPath)
     terms = without_constraint(given_terms)
     drift, noise = _drift_and_noise(terms)
-    check_state(y0, "suggest_solver")
+    check_state("suggest_solver", y0)
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
     check_terms_fit_state(terms, t0, y0, args)
     check_drifts_differ(terms)
@@ -308,12 +308,12 @@ def _inspect(
         or noises_commute(noise, t0, y0, args)
     )
     _, friction_terms = friction_apart(drift)
-    friction = takes_friction_apart(terms, t0, y0, args, BAOAB())
+    friction = accepts_friction(terms, t0, y0, args, BAOAB())
     general_bath = (
         not friction
         and len(friction_terms) > 0
         and not constrained
-        and takes_friction_apart(terms, t0, y0, args, _BATH_OF_ANY_ENERGY)
+        and accepts_friction(terms, t0, y0, args, _BATH_OF_ANY_ENERGY)
     )
     return _System(
         structures=structures,
@@ -400,14 +400,15 @@ def _drift_and_noise(terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
     return drift, noise
 
 
-def takes_friction_apart(
+def accepts_friction(
     terms: diffrax.AbstractTerm,
     t0: RealScalarLike,
     y0: Y,
     args: Args,
     solver: BAOAB,
 ) -> bool:
-    """Whether these are Langevin terms that this `BAOAB` accepts."""
+    """Whether these are Langevin terms that this `BAOAB` accepts: terms that it refuses for
+    any reason count as others."""
     try:
         solver.check(terms, t0, y0, args)
     except ValueError:

@@ -78,7 +78,7 @@ def symplecticity_defect(
     floating-point numbers; an error when run if the solver reports a failed step.
     """
     check_pair(y0)
-    check_state(y0, "symplecticity_defect")
+    check_state("symplecticity_defect", y0)
     flat, unravel = jfu.ravel_pytree(y0)
 
     def step(x: Array) -> tuple[Array, diffrax.RESULTS]:

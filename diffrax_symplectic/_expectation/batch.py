@@ -136,7 +136,7 @@ def _moments_on_device(
     those of `_moments_on_devices`."""
     # The places of the samples among those of all devices.
     index = device * samples_per_device + jnp.arange(samples_per_device)
-    high, low = _sum_in_halves(low_high, index)
+    high, low = _high_and_low_of_sum(low_high, index)
     key = jr.wrap_key_data(jnp.asarray(key_data), impl=key_impl)
 
     def sample_key(high: Array, low: Array) -> PRNGKeyArray:
@@ -147,8 +147,8 @@ def _moments_on_device(
     is_wanted = index < num_wanted
     good = samples.good & is_wanted
     # (levels, samples)
-    num_failed = jnp.where(is_wanted, samples.num_failed, 0)
-    num_failed_on_any = jnp.sum(jnp.max(num_failed, axis=0))
+    failures = jnp.where(is_wanted, samples.num_failed, 0)
+    num_failed_on_any = jnp.sum(jnp.max(failures, axis=0))
     fields = samples.averaged.fields
     # All fields of one shape are summed at once, since fewer operations compile sooner.
     stacked = jtu.tree_map(lambda *of_fields: jnp.stack(of_fields), *fields.values())
@@ -164,7 +164,7 @@ def _moments_on_device(
     return BatchMoments(
         num_good=jnp.sum(good),
         num_failed=num_failed_on_any,
-        failed_on=jnp.sum(num_failed, axis=1),
+        failed_on=jnp.sum(failures, axis=1),
         mean=averaged_of("mean"),
         mean_correction=averaged_of("mean_correction"),
         norm=averaged_of("norm"),
@@ -173,11 +173,11 @@ def _moments_on_device(
     )
 
 
-def _sum_in_halves(
+def _high_and_low_of_sum(
     low_high: UInt32[Array, "2"], index: Int[Array, " n"]
 ) -> tuple[UInt32[Array, " n"], UInt32[Array, " n"]]:
-    """The high and the low 32 bits of a number, from its low and its high ones, plus an
-    index. (There may be no 64-bit integers.)"""
+    """The high and the low 32 bits of a sum: a number, whose low and high bits are in
+    `low_high`, plus an index. (There may be no 64-bit integers.)"""
     first_low = low_high[0]
     first_high = low_high[1]
     low = first_low + index.astype(jnp.uint32)

@@ -23,11 +23,11 @@ from .._root_finder import (
     all_finite,
     best_relaxation,
     Halves,
-    MARGIN,
+    LOG2_MARGIN,
+    LOG2_STALLED,
     PicardNewton,
     ROUNDINGS,
     SLOW,
-    STALLED,
 )
 from .._solver import with_changed_stages
 
@@ -104,9 +104,9 @@ class _Criterion(NamedTuple):
         # with the tolerance over a margin, here without a division. If corrections grow,
         # the ratio says nothing, and counts as one.
         smaller = jnp.where(size < size_before, size, size_before)
-        is_next_small = 2.0**MARGIN * size * smaller <= size_before
+        is_next_small = 2.0**LOG2_MARGIN * size * smaller <= size_before
         # Rounding errors do not shrink any further.
-        is_stalled = size >= 2.0**STALLED * size_before
+        is_stalled = size >= 2.0**LOG2_STALLED * size_before
         is_rounding = _largest(sizes) <= self.rounding
         return size, is_next_small | (is_stalled & is_rounding)
 

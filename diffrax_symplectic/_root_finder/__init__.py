@@ -3,6 +3,10 @@ from .linear import correction as correction, eliminate as eliminate
 from .linear import MAX_WRITTEN_OUT as MAX_WRITTEN_OUT, solve_matrix as solve_matrix
 from .picard_newton import PicardNewton as PicardNewton
 from .sweeps import best_relaxation as best_relaxation, Halves as Halves
-from .sweeps import SLOW as SLOW, STALLED as STALLED
-from .tolerance import all_finite as all_finite, MARGIN as MARGIN, max_norm as max_norm
+from .sweeps import SLOW as SLOW, LOG2_STALLED as LOG2_STALLED
+from .tolerance import (
+    all_finite as all_finite,
+    LOG2_MARGIN as LOG2_MARGIN,
+    max_norm as max_norm,
+)
 from .tolerance import ROUNDINGS as ROUNDINGS

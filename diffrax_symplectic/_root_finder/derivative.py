@@ -27,7 +27,7 @@ def differentiate(
 ) -> PyTree[Array]:
     r"""The tangent $x = L x + b$ of the solution of $k = \Phi(k)$, where $L$ is the
     derivative of $\Phi$ along $k$ and $b$ the derivative along everything else; and by
-    transposition its adjoint.
+    transposition its adjoint. `linear` is the function $L$, and `rhs` is $b$.
 
     A `solver`, such as the linear solver of `optx.Newton`, solves for any number of
     unknowns. If it is `None`, up to four unknowns are solved for by elimination, and more

@@ -192,10 +192,11 @@ def _clear_column(k: IntScalarLike, rows: Float[Array, "n m"]) -> Float[Array, "
     row_numbers = jnp.arange(len(rows))
     # The rows above row `k` have had their turn. A negative size is never the largest.
     sizes = jnp.where(row_numbers < k, -1, jnp.abs(rows[:, k]))
-    pivot = jnp.argmax(sizes)
-    pivot_row = rows[pivot] / rows[pivot, k]
+    pivot_number = jnp.argmax(sizes)
+    pivot_row = rows[pivot_number] / rows[pivot_number, k]
+    # Row `k` takes the place of the pivot's row, whose own place is set in the last line.
     # Rows are replaced by selections, which the fused engine replays. It does not replay a
     # scatter to a row that differs between paths.
-    rows = jnp.where((row_numbers == pivot)[:, None], rows[k], rows)
+    rows = jnp.where((row_numbers == pivot_number)[:, None], rows[k], rows)
     cleared = rows - rows[:, k, None] * pivot_row
     return jnp.where((row_numbers == k)[:, None], pivot_row, cleared)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 from .._batch import batched_like, materialize, most_of_batch
 from .._compat import ω
 from .._custom_types import IntScalarLike
-from .tolerance import converged, CorrectionSize, log2, MARGIN, Tolerance
+from .tolerance import converged, CorrectionSize, log2, LOG2_MARGIN, Tolerance
 
 
 Map: TypeAlias = Callable[[PyTree[Array]], PyTree[Array]]
@@ -38,9 +38,9 @@ SLOW = 0.3
 _STRONGEST_RELAXATION = 0.5
 # The base-2 logarithm of the rate expected of relaxed sweeps, a quarter. By Young's formula
 # the rate is 0.17 or better for rates up to one, but only after the first few sweeps.
-_RELAXED_RATE = -2.0
+_LOG2_RELAXED_RATE = -2.0
 # The base-2 logarithm of 0.87, the rate above which sweeps count as not converging.
-STALLED = -0.2
+LOG2_STALLED = -0.2
 
 
 class Halves(NamedTuple):
@@ -227,7 +227,7 @@ def _decide(
     # The rate is a base-2 logarithm, so that the number of further sweeps is a quotient.
     rate = (level - last_level) / state.num_ahead
     num_done = state.num_done + state.num_ahead
-    has_stalled = rate >= STALLED
+    has_stalled = rate >= LOG2_STALLED
     has_converged = converged(level, rate, correction.is_rounding, has_stalled)
     # Sweeps that diverged get one more try. If it stalls, Newton's method takes over.
     starts_again = has_stalled & (state.relaxation > _STRONGEST_RELAXATION)
@@ -235,8 +235,10 @@ def _decide(
     # The relaxation is tuned once, at the first check: later rates are those of relaxed
     # sweeps, to which the formula does not apply.
     is_tuned_now = (state.num_done == 0) & (ratio > SLOW) & ~has_stalled
-    # After so many sweeps the level is at `-MARGIN`.
-    num_needed = (level + MARGIN) / jnp.where(is_tuned_now, -_RELAXED_RATE, -rate)
+    # After so many sweeps the level is at `-LOG2_MARGIN`.
+    num_needed = (level + LOG2_MARGIN) / jnp.where(
+        is_tuned_now, -_LOG2_RELAXED_RATE, -rate
+    )
     # Sweeps that would not end in time end now, before they cost anything.
     in_time = starts_again | (~has_stalled & (num_done + num_needed < max_sweeps))
     pending = state.pending & ~has_converged & in_time & (num_done < max_sweeps)

@@ -24,7 +24,7 @@ _WIDE = 32
 # The next correction must be below the tolerance by a factor of 64, of which this is the
 # base-2 logarithm. The remaining error has the same sign in every step and would add up to
 # a drift, while rounding errors cancel.
-MARGIN = 6
+LOG2_MARGIN = 6
 # Corrections below this many roundings of the whole state may be the rounding errors of all
 # stages together. They count as rounding errors only if they no longer shrink.
 ROUNDINGS = 100
@@ -147,11 +147,11 @@ def log2(x: Scalar) -> Scalar:
 def converged(
     level: Scalar, rate: Scalar, is_rounding: _Flag, has_stalled: _Flag
 ) -> _Flag:
-    """Whether the next correction will be below the tolerance by `MARGIN`; or corrections
-    no longer shrink (`has_stalled`) and are as small as rounding errors (`is_rounding`).
-    `level` and `rate` are the base-2 logarithms of the last correction, in units of the
-    tolerance, and of its ratio to the previous one."""
+    """Whether the next correction will be below the tolerance by `LOG2_MARGIN`; or
+    corrections no longer shrink (`has_stalled`) and are as small as rounding errors
+    (`is_rounding`). `level` and `rate` are the base-2 logarithms of the last correction, in
+    units of the tolerance, and of its ratio to the previous one."""
     # With linear convergence the next correction is smaller by the same ratio. A correction
     # that grew says nothing about the next one, so that it must be small itself.
     next_level = level + jnp.minimum(rate, 0)
-    return (next_level <= -MARGIN) | (has_stalled & is_rounding)
+    return (next_level <= -LOG2_MARGIN) | (has_stalled & is_rounding)

@@ -79,7 +79,7 @@ def by_jax(
     problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> Batch:
     """The paths with these sample numbers, on one level, simulated by JAX, with the loop of
-    `expectation`."""
+    `expectation`, which simulates all levels."""
     high, low = _words(sample_numbers)
     states_and_failed = _paths_by_jax(problem, key, high, low)
     # The results are traced if a function of the user closes over traced values.

@@ -141,7 +141,7 @@ class Problem(eqx.Module):
             y0 = drawn_state(y0_of, jr.key(1), args)
         else:
             y0 = given_state(y0)
-        check_state(y0, caller)
+        check_state(caller, y0)
         if y0_of is None:
             check_finite(y0)
 

@@ -182,7 +182,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
     def check(self, terms, t0, y0: Y, args: Args) -> None:
         """Raises a `ValueError` unless the state and the terms suit the solver."""
         solver_name = type(self).__name__
-        check_state(y0, solver_name)
+        check_state(solver_name, y0)
         drift, noise = split_terms(terms)
         check_structure(self.structure, drift, noise, t0, y0, args, solver_name)
 

@@ -304,7 +304,8 @@ def _noise_change(
     args: Args,
     solver_name: str,
 ) -> Array:
-    """The change of the momenta by the noise, as a vector."""
+    """The change of the momenta by the noise, as a vector. The vector fields are taken at
+    the middle of the step."""
     variables = drawn_variables(noise, ["W"], t0, t1, solver_name)
     change, _ = apply(noise, variables["W"], args, t0 + (t1 - t0) / 2, y)
     return jfu.ravel_pytree(change)[0]

@@ -85,9 +85,8 @@ def _attributes_for(names: list[str]) -> tuple[list[str], list[str]]:
             # Most variables are attributes themselves.
             required.append(name)
         else:
-            attributes, optional_attributes = held
-            required += attributes
-            optional += optional_attributes
+            required += held.required
+            optional += held.optional
     # Each is drawn once, although several variables may be computed from it.
     return list(dict.fromkeys(required)), optional
 

@@ -99,7 +99,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
 
     def check(self, terms, t0, y0: Y, args: Args) -> None:
         solver_name = type(self).__name__
-        check_state(y0, solver_name)
+        check_state(solver_name, y0)
         terms, y0 = momentum_first(terms, y0)
         drift, friction, noise = split_friction(terms)
         kicks, rest = kicks_and_rest(self.flow, drift)

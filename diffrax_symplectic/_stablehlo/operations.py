@@ -20,7 +20,7 @@ from .tensor import map_entries, same_table, Tensor
 
 
 def rule_of(name: str) -> Rule | None:
-    """The rule for an operation, by its name without the dialect."""
+    """The rule for an operation, by its name without the dialect; `None` if it has none."""
     of_real = elementwise().get(name)
     of_complex = complex_functions().get(name)
     if of_real is None and of_complex is None:

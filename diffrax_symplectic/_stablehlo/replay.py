@@ -81,18 +81,20 @@ class Replay:
         `constants` are what `self.constants()` returned. Without it, large constants are
         written into the kernel.
         """
-        errors: list[Any] = []
+        failures: list[Any] = []
         self._memory = dict(zip(self._constants, constants))
-        return self._call("main", args, errors), errors
+        return self._call("main", args, failures), failures
 
     def _call(
-        self, name: str, args: Sequence[Tensor], errors: list[Any]
+        self, name: str, args: Sequence[Tensor], failures: list[Any]
     ) -> list[Tensor]:
         """The results of a function of the program, which sees its arguments only."""
-        return self._block(block_of(self._functions[name]), args, ChainMap(), errors)
+        return self._run_block(
+            block_of(self._functions[name]), args, ChainMap(), failures
+        )
 
-    def _block(
-        self, block: Any, args: Sequence[Tensor], outer: Values, errors: list[Any]
+    def _run_block(
+        self, block: Any, args: Sequence[Tensor], outer: Values, failures: list[Any]
     ) -> list[Tensor]:
         """What a block returns, whose operations run one after another. `outer` holds the
         variables that it sees from outside."""
@@ -103,17 +105,17 @@ class Replay:
             operands = [values[operand] for operand in op.operands]
             if op.name in _RETURNS:
                 return operands
-            results = self._results(op, operands, values, errors)
+            results = self._results(op, operands, values, failures)
             values.update(zip(op.results, results))
         raise AssertionError("A block ends with what it returns.")
 
     def _results(
-        self, op: Any, operands: list[Tensor], values: Values, errors: list[Any]
+        self, op: Any, operands: list[Tensor], values: Values, failures: list[Any]
     ) -> list[Tensor]:
         """The results of one operation."""
         if op.name == "func.call":
             try:
-                return self._call(callee_of(op), operands, errors)
+                return self._call(callee_of(op), operands, failures)
             except NotReplayed as error:
                 # An operation in a called function has no location in its caller.
                 error.location += str(op.location)
@@ -126,9 +128,9 @@ class Replay:
             return [Tensor([], tuple(result.type.shape)) for result in op.results]
 
         def run(i: int, args: Sequence[Tensor]) -> list[Tensor]:
-            return self._block(block_of(op, i), args, values, errors)
+            return self._run_block(block_of(op, i), args, values, failures)
 
-        operation = Operation(op, run, errors)
+        operation = Operation(op, run, failures)
         rule = rule_of(operation.name)
         if rule is None:
             raise NotReplayed(op)

@@ -154,7 +154,7 @@ def _strong_conditions(tableau: AbstractTableau) -> dict:
 
 @_strong_conditions.register
 def _(tableau: GeneralTableau) -> dict:
-    _check_noise(tableau)
+    _check_only_increment_drives_noise(tableau)
     return {
         "alpha.e - 1": tableau.alpha.sum() - 1,
         "beta.e - 1": tableau.beta.sum() - 1,
@@ -219,7 +219,7 @@ def _weak_conditions(tableau: AbstractTableau) -> _WeakConditions:
 @_weak_conditions.register
 def _(tableau: GeneralTableau) -> _WeakConditions:
     """For one noise, and order 1 for any number."""
-    _check_noise(tableau)
+    _check_only_increment_drives_noise(tableau)
     # Short names, for formulas that can be compared with their keys.
     al = tableau.alpha
     be = tableau.beta
@@ -336,8 +336,9 @@ def _(tableau: AdditiveTableau) -> _WeakConditions:
     return _WeakConditions(first, second)
 
 
-def _check_noise(tableau: GeneralTableau) -> None:
-    """Raises a `ValueError` unless the increment drives the noise of a general tableau."""
+def _check_only_increment_drives_noise(tableau: GeneralTableau) -> None:
+    """Raises a `ValueError` unless the increment alone drives the noise of a general
+    tableau."""
     # All variables share the weights. So another variable that multiplies the noise itself
     # would add to the increment, and change all moments that the conditions are made of.
     # Variables that multiply brackets are of higher order: their expectation is counted.

@@ -318,7 +318,8 @@ class SeparableTableau(AbstractTableau):
         )
 
     def partitioned(self) -> "PartitionedTableau":
-        """The same method, with explicit coefficients for the velocities."""
+        """The same method, with the coefficients of the velocities listed, too: here they
+        are those of the forces."""
         return PartitionedTableau(
             alpha=self.alpha,
             alpha_hat=self.alpha,

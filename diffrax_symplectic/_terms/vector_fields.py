@@ -186,8 +186,8 @@ def _checked_sum(changes: list[Y], y: Y) -> Y:
 def _check_change(change: Any, x: Any) -> None:
     """Raises a `ValueError` unless the change of an array `x` of the state has the dtype
     and the shape of `x`."""
-    # Either may be a number of Python or NumPy. Arrays have a `.dtype`, which need not be
-    # the `jnp.result_type` of a scalar.
+    # Either may be a number of Python or NumPy. Of a weakly typed array `jnp.result_type`
+    # is the default dtype, not its own.
     change = jnp.asarray(change)
     x = jnp.asarray(x)
     if (change.dtype, change.shape) != (x.dtype, x.shape):

@@ -17,7 +17,7 @@ from .moments import Moments
 _AVERAGED = ("mean", "norm", "largest", "size")
 _NUMBERS = ("begin", "end", "num_good", "num_failed", "failed_on")
 # The fields of an estimate that JSON takes as they are.
-_PLAIN_FIELDS = ("paths_per_sample", "rounding_floor", "reason", "tol_reached")
+_FIELDS_OF_ESTIMATE = ("paths_per_sample", "rounding_floor", "reason", "tol_reached")
 
 
 def header_of(estimate: Any) -> dict[str, Any]:
@@ -31,7 +31,7 @@ def header_of(estimate: Any) -> dict[str, Any]:
     sampling = estimate.sampling
     sampling_fields = {} if sampling is None else vars(sampling)
     # A function, such as `sort_by`, is left out.
-    plain_fields = {
+    sampling_fields_as_json = {
         name: _number_for_json(x) for name, x in sampling_fields.items() if _is_plain(x)
     }
     # The names here are those of the files.
@@ -41,10 +41,10 @@ def header_of(estimate: Any) -> dict[str, Any]:
         "averaged": list(batch.mean.fields),
         "dtypes": jtu.tree_leaves(batch.dtypes),
         "sampling": None if sampling is None else type(sampling).__name__,
-        "fields": plain_fields,
+        "fields": sampling_fields_as_json,
         "tails": estimate.tails is not None,
     }
-    return header | {name: getattr(estimate, name) for name in _PLAIN_FIELDS}
+    return header | {name: getattr(estimate, name) for name in _FIELDS_OF_ESTIMATE}
 
 
 def arrays_of(estimate: Any) -> dict[str, np.ndarray]:
@@ -96,7 +96,7 @@ def fields_from(
         return Moments(**numbers, **trees, dtypes=dtypes)
 
     moments = [moments_of_batch(*of_batch) for of_batch in enumerate(header["ranges"])]
-    fields = {name: header[name] for name in _PLAIN_FIELDS}
+    fields = {name: header[name] for name in _FIELDS_OF_ESTIMATE}
     return fields | {
         "moments": tuple(moments),
         "key_data": arrays["key_data"],

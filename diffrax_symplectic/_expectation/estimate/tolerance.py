@@ -49,8 +49,8 @@ def share_of_needed(estimate: Expectation, tol: float | None) -> float:
 
 
 def shortfall(estimate: Expectation, tol: float) -> str:
-    """Which part of the error exceeds the tolerance, and what it would take: for messages,
-    one or two sentences without their first capital and their last full stop."""
+    """Which part of the error keeps it above the tolerance, and what it would take: for
+    messages, one or two sentences without their first capital and their last full stop."""
     if is_any_true(estimate.off_order):
         return (
             "the changes from step to step do not fit the order of the solver, so the "
@@ -69,7 +69,10 @@ def shortfall(estimate: Expectation, tol: float) -> str:
             f"{discretization:.1e} remains of the discretization error with "
             f"{estimate.levels} levels. Pass a smaller `dt0`, or more `levels`"
         )
-    needed_paths = estimate.num_paths * (sampling_error / tol) ** 2
+    # What the other parts of the error leave of the tolerance, at least a tenth.
+    others = np.hypot(discretization, failed_error)
+    allowed = max(tol**2 - others**2, (tol / 10) ** 2) ** 0.5
+    needed_paths = estimate.num_paths * (sampling_error / allowed) ** 2
     return (
         f"the sampling error is {sampling_error:.1e} after {estimate.num_paths:,} paths. "
         f"It takes about {needed_paths:.1e} paths: continue with `start=`, or pass another "

@@ -30,7 +30,7 @@ _MOST_POLYNOMIALS = 130
 # are allowed would be of degree 129.)
 _HIGHEST_DEGREE = 8
 # Degrees up to this one are tried however long they take.
-_LEAST_DEGREE_TRIED = 2
+_ALWAYS_TRIED_UP_TO = 2
 # The most bytes that a fit may take, so that it fits into machines of 8 GiB.
 _MOST_MEMORY = 4 * 2**30
 # The most entries of states that a fit computes without a warning that it will take long
@@ -119,6 +119,7 @@ def _candidate_degrees(d: int, num_nodes: int, total_steps: int) -> tuple[int, .
     """The degrees to try: the highest that has few polynomials and does not take too long,
     and all even degrees below it."""
     if _too_many_for_least_squares(d):
+        # Both that `Quadratic` has.
         return (1, 2)
 
     def is_allowed(degree: int) -> bool:
@@ -126,7 +127,7 @@ def _candidate_degrees(d: int, num_nodes: int, total_steps: int) -> tuple[int, .
             return False
         # The ends of all steps from all points of the fit.
         num_ends = Hermite(d, (degree,)).num_sites * num_nodes * total_steps
-        return degree <= _LEAST_DEGREE_TRIED or num_ends <= _MOST_ENDS
+        return degree <= _ALWAYS_TRIED_UP_TO or num_ends <= _MOST_ENDS
 
     *lower, highest = filter(is_allowed, range(1, _HIGHEST_DEGREE + 1))
     lower_even = [degree for degree in lower if degree % 2 == 0]

@@ -331,7 +331,8 @@ def _fits_and_failures(
     functions_of_levels = []
     failures_of_levels = []
     for index in range(len(problem.levels.h)):
-        # An array, by which one program fits all levels.
+        # An integer would be static: a program for each level. Its shape keeps the axis of
+        # levels, along which the fits are joined below.
         functions, num_failed = _fit_of_level(problem, np.array([index]), key, basis)
         functions_of_levels.append(functions)
         failures_of_levels.append(num_failed)

@@ -142,7 +142,7 @@ def constrained_state(
             "`hamiltonian_terms(H0, constraint=constraint)`."
         )
     check_pair(y0)
-    check_state(y0, "constrained_state")
+    check_state("constrained_state", y0)
     t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(y0)))
     drift, _, _ = split_friction(without_constraint(terms))
     check_terms_fit_state(diffrax.MultiTerm(*drift), t, y0, args)

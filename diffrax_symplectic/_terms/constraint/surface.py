@@ -63,8 +63,8 @@ class Surface(NamedTuple):
     def of(
         terms: PyTree[diffrax.AbstractTerm], t: RealScalarLike, y: PyTree, args: Args
     ) -> "Surface":
-        """The surface of constrained terms. Raises a `ValueError` if the constraint does
-        not return an array of shape `(c,)`."""
+        """The surface of constrained terms. Its `residual` raises a `ValueError` if the
+        constraint does not return an array of shape `(c,)`."""
         constraint = constraint_of(terms)
         assert constraint is not None
         drift, _, _ = split_friction(without_constraint(terms))
@@ -75,7 +75,8 @@ class Surface(NamedTuple):
             return _checked_values(constraint, unravel(q), args)
 
         def velocity(p: Vector) -> Vector:
-            # H0 is separable, so any position gives the same velocity.
+            # H0 is separable, so any position gives the same velocity. Momenta have the
+            # structure of positions.
             _, dq = rate(drift, t, (unravel(p), q0), args)
             flat, _ = jfu.ravel_pytree(dq)
             return flat

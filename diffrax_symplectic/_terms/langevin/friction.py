@@ -329,7 +329,8 @@ def checked_friction(
             f"or a function `(t, q, args)`; got {friction!r}."
         )
     if path_struct is None:
-        # The shapes of the momenta are known in the solve only.
+        # The shapes of the momenta are known in the solve only, so a single value is kept
+        # as one for all arrays of momenta.
         return jtu.tree_map(
             lambda value: _checked_friction_of_array(value, None), friction
         )
