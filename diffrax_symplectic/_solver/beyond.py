@@ -62,12 +62,12 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=(2, 1),
         strong=None,
-        choose="For accurate expectations: four stage vectors in three small systems. "
-        "Not for long steps, omega h > 1.",
+        choose="For accurate expectations: four stage vectors in three small systems.",
         noises="commuting",
         suggested=("weak",),
         right_energy_unresolved=True,
         most_friction=0.5,
+        most_frequency=1.0,
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau(
         alpha=_HALVES,
