@@ -166,9 +166,9 @@ def expectation(
     by more than the standard error, if a few samples account for most of the variance, if
     all samples are equal or underflow, if a fit was dropped or takes long, and if `phi` is
     not smooth and a trial with Gaussian increments has another mean than discrete ones. Of
-    the steps: if two levels do not agree, if steps at `y0` are too long for an explicit
-    solver or for the friction, and if rounding in single precision may exceed the standard
-    error.
+    the steps: if two levels do not agree, if steps are too long at `y0` for an explicit
+    solver, for [`diffrax_symplectic.StrangGauss`][] or for the friction, and if rounding in
+    single precision may exceed the standard error.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and

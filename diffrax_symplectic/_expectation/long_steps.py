@@ -32,6 +32,8 @@ _UNSTABLE = 1.1
 # After this many steps of the tangent flow any change of the state points in the most
 # unstable direction. Its growth is measured over as many more steps.
 _ITERATIONS = 50
+# The same for the square of the largest frequency, which need not be known as well.
+_ITERATIONS_FOR_FREQUENCY = 15
 # The part of `dt0` that is surely short enough. If such a step fails, too, the length of
 # steps is not the cause.
 _SHORT = 1e-6
@@ -189,9 +191,10 @@ def _growth(problem: Problem, numbers: Float[Array, " times"]) -> _Growth:
         def derivative(change: Array) -> Array:
             return jax.jvp(step, (flat_y0,), (change,))[1]
 
-        return _largest_growth(derivative, flat_y0)
+        return _largest_growth(derivative, flat_y0, _ITERATIONS)
 
-    return jax.vmap(growth_in_step)(numbers)
+    # This compiles faster than `jax.vmap`, and takes less memory.
+    return lax.map(growth_in_step, numbers)
 
 
 def _frequencies(
@@ -212,31 +215,34 @@ def _frequencies(
             dy = rate(drift, t, unravel(x), problem.args)
             return jfu.ravel_pytree(dy)[0]
 
-        _, derivative = jax.linearize(rate_of_drift, flat_y0)
+        def derivative(_, change: Array) -> Array:
+            return jax.jvp(rate_of_drift, (flat_y0,), (change,))[1]
 
         # An oscillation has a pair of eigenvalues, i omega and -i omega. Applied twice, the
-        # derivative has -omega^2 in the whole plane of the oscillation.
+        # derivative has -omega^2 in the whole plane of the oscillation. (In a loop, it is
+        # compiled once.)
         def derivative_twice(change: Array) -> Array:
-            return derivative(derivative(change))
+            return lax.fori_loop(0, 2, derivative, change)
 
-        growth = _largest_growth(derivative_twice, flat_y0)
+        growth = _largest_growth(derivative_twice, flat_y0, _ITERATIONS_FOR_FREQUENCY)
         oscillates = growth.along_itself < 0
         return jnp.where(oscillates, jnp.exp(growth.log_growth / 2), 0)
 
-    return jax.vmap(frequency)(numbers)
+    return lax.map(frequency, numbers)
 
 
 def _largest_growth(
-    linear: Callable[[Array], Array], like: Float[Array, " n"]
+    linear: Callable[[Array], Array], like: Float[Array, " n"], iterations: int
 ) -> _Growth:
-    """The growth of the change that a linear map enlarges most, by power iteration."""
+    """The growth of the change that a linear map enlarges most, by power iteration: after
+    this many applications of the map, over as many more."""
 
     def after_map(number: Array, before: _Growth) -> _Growth:
         change = linear(before.change)
         # The change before the map has length one, so this is its growth.
         length = jnp.linalg.norm(change)
-        counted_log = jnp.where(number < _ITERATIONS, 0.0, jnp.log(length))
-        log_growth = before.log_growth + counted_log / _ITERATIONS
+        counted_log = jnp.where(number < iterations, 0.0, jnp.log(length))
+        log_growth = before.log_growth + counted_log / iterations
         along_itself = before.change @ change
         # Without a drift, as between two pulses, nothing is left of a change.
         scaled = jnp.where(length > 0, change / length, before.change)
@@ -247,7 +253,7 @@ def _largest_growth(
     direction = jnp.cos(1.0 + jnp.arange(like.size, dtype=like.dtype))
     zero = jnp.zeros((), like.dtype)
     start = _Growth(direction / jnp.linalg.norm(direction), zero, zero)
-    return lax.fori_loop(0, 2 * _ITERATIONS, after_map, start)
+    return lax.fori_loop(0, 2 * iterations, after_map, start)
 
 
 _quick_growth = quickly_compiled(_growth)
