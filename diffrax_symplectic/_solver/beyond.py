@@ -68,12 +68,11 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         right_energy_unresolved=True,
         most_friction=0.5,
         # With two levels, the share of means that were off by more than two error bars, for
-        # all phases of a Kubo oscillator with noise 0.27 (p^2 + q^2) / 2 in units of
-        # omega, up to the time 30 / omega: 3% for omega h = 1, 11% for 1.5, 23% for 2, 62%
-        # for 3; with half the noise and up to 120 / omega, 17% for 1. Three levels of a
-        # quantum system, coupled by pulses: 3 of 36 populations for omega h up to 1.1,
-        # where one, between changes of opposite signs, was off by 3.8; 21 of 36 for 2 and
-        # more, by up to 27.
+        # all phases of a Kubo oscillator with noise 0.27 (p^2 + q^2) / 2 in units of omega:
+        # 1, 3, 11, 19 and 36% for omega h = 0.5, 1, 1.5, 2 and 3 up to the time 30 / omega;
+        # 4, 14, 31, 54 and 73% up to 100 / omega. Three levels of a quantum system, coupled
+        # by pulses: 3 of 36 populations for omega h up to 1.1, where one, between changes
+        # of opposite signs, was off by 3.8; 21 of 36 for 2 and more, by up to 27.
         most_frequency=1.0,
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau(
