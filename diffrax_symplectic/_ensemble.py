@@ -201,7 +201,8 @@ def ensemble(
     batch_size = min(whole_number("batch_size", batch_size), num_paths)
     batches = _simulated_batches(problem, key, engine, num_paths, batch_size)
     whole = _concatenated(batches, num_paths, at_end=ts is None)
-    _warn_of_failures(whole, problem.has_bounded_increments)
+    advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
+    _warn_of_failures(whole, advice)
     # The times of the steps, from which the times of the user differ by rounding errors.
     saved_steps = np.asarray(problem.levels.saved_steps[0])
     saved_times = float(problem.t0) + saved_steps * float(problem.levels.h[0])
@@ -256,15 +257,14 @@ def _concatenated(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
     return Batch(y, failed, sum(batch.num_stragglers for batch in batches))
 
 
-def _warn_of_failures(whole: Batch, bounded: bool) -> None:
-    """Warns of failed paths and of many stragglers among all paths. `bounded` is as for
-    `advice_on_failures`."""
+def _warn_of_failures(whole: Batch, advice: str) -> None:
+    """Warns of failed paths, with advice, and of many stragglers among all paths."""
     num_paths = len(whole.failed)
     num_failed = int(np.sum(whole.failed))
     if num_failed > 0:
         warnings.warn(
             f"{num_failed:,} of {num_paths:,} paths failed. Their states are NaN: select "
-            f"the others with `~failed`. {advice_on_failures(bounded)}",
+            f"the others with `~failed`. {advice}",
             stacklevel=3,
         )
     warn_of_stragglers(whole.num_stragglers, num_failed, num_paths, stacklevel=3)

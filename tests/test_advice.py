@@ -173,6 +173,36 @@ def test_in_a_nonlinear_system_the_first_suggestion_says_for_what_it_is_not():
         assert good or re.search(NONLINEAR, first.reason), (name, rows)
 
 
+LIMITED = [kind for kind in SUGGESTED if kind().record.most_frequency is not None]
+
+
+@pytest.mark.parametrize("kind", LIMITED, ids=lambda kind: kind.__name__)
+def test_two_levels_hold_up_to_the_frequency_of_the_record(kind):
+    """Of the means of a Kubo oscillator for all phases and times up to 30, few are off by
+    more than two error bars with steps of this length, and many with twice as long ones."""
+    most = kind().record.most_frequency
+    path = kind().path((), jr.key(0), want="weak")
+    kubo = lambda t, p, q, args: 0.27 * (p**2 + q**2) / 2
+    terms = ds.hamiltonian_terms(_well, kubo, path)
+    hs = most * np.array([0.5, 1.0, 2.0])
+    maps = _maps(terms, advice.with_newton(kind()), jnp.asarray(hs))
+    # Of q + i p, which each step multiplies by a number in the mean: q is the third of the
+    # moments of (1, p, q), and becomes the real part, p the imaginary part.
+    half, one, two = maps[:, 2, 2] + 1j * maps[:, 1, 2]
+    starts = np.exp(1j * np.linspace(0, np.pi, 16, endpoint=False))
+
+    def share(h, factor, factor_of_half):
+        number = np.arange(1, round(30 / h) + 1)[:, None]
+        exact = np.real(starts * np.exp(number * h * (-1j - 0.27**2 / 2)))
+        long = np.real(starts * factor**number)
+        short = np.real(starts * factor_of_half ** (2 * number))
+        change = (short - long) / (2 ** kind().record.order("weak", True) - 1)
+        return np.mean(np.abs(short + change - exact) > 2 * np.abs(change))
+
+    assert share(hs[1], one, half) <= 0.05
+    assert share(hs[2], two, one) >= 0.15
+
+
 @pytest.mark.parametrize("h", [*RESOLVED, *STIFF])
 def test_without_brackets_levy_areas_change_nothing(h):
     """So the facts about noise on harmonic modes are those of the midpoint rule."""

@@ -4,7 +4,7 @@ In the order of a call of `expectation`:
 
 - `expectation`, `monte_carlo`: the functions; `call`: what they check alike.
 - `choose`: the sampling, if the user did not choose one, by `cost`, what a step costs, and
-  `kinks`, whether `phi` is smooth; `long_steps`, whether an explicit step is stable;
+  `kinks`, whether `phi` is smooth; `long_steps`, whether steps are too long at `y0`;
   `strong_friction`, whether steps resolve the friction.
 - `sampling`: what a sampling is. It makes a plan of how samples are taken.
 - `independent`, `sorted/`, `fitted/`: the samplings. Each simulates its paths by the loop

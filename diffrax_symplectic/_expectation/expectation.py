@@ -38,7 +38,7 @@ from .estimate import (
 )
 from .fused_paths import FusedPaths
 from .kinks import has_kinks
-from .long_steps import is_unstable_at_start, may_be_too_long
+from .long_steps import may_be_too_long, too_long_steps
 from .run import Meter, NO_METER, run
 from .sampling import AbstractSampling
 from .strong_friction import unresolved_friction
@@ -166,9 +166,9 @@ def expectation(
     by more than the standard error, if a few samples account for most of the variance, if
     all samples are equal or underflow, if a fit was dropped or takes long, and if `phi` is
     not smooth and a trial with Gaussian increments has another mean than discrete ones. Of
-    the steps: if two levels do not agree, if steps at `y0` are too long for an explicit
-    solver or for the friction, and if rounding in single precision may exceed the standard
-    error.
+    the steps: if two levels do not agree, if steps are too long at `y0` for an explicit
+    solver, for [`diffrax_symplectic.StrangGauss`][] or for the friction, and if rounding in
+    single precision may exceed the standard error.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and
@@ -211,7 +211,9 @@ def expectation(
             f"`{type(solver).__name__}`: pass `dt0={float(dt0) / 4:g}` or less, or an "
             "implicit solver. "
         )
-    for message in cautions(estimate, tol, problem.has_bounded_increments, cause):
+    has_bounded_increments = problem.has_bounded_increments
+    is_implicit = problem.is_implicit
+    for message in cautions(estimate, tol, has_bounded_increments, is_implicit, cause):
         warnings.warn(message, stacklevel=2)
     paths = plan.simulate_paths
     if isinstance(paths, FusedPaths):
@@ -223,18 +225,11 @@ def expectation(
     if start is None and first == 0:
         # With three levels the order is checked, which shows such steps. With one level the
         # result does not claim to include the discretization error.
-        if estimate.levels == 2 and is_unstable_at_start(problem):
-            warnings.warn(
-                f"Steps of `dt0={float(dt0):g}` are too long for `{type(solver).__name__}` "
-                "where paths start: a small change of the state grows in each step, with "
-                "alternating signs. Where forces are bounded, such steps leave random "
-                "states, and two levels may agree on a wrong mean. Pass a smaller `dt0`.",
-                stacklevel=2,
-            )
         if estimate.levels == 2:
-            message = unresolved_friction(problem, float(dt0))
-            if message is not None:
-                warnings.warn(message, stacklevel=2)
+            for check in (too_long_steps, unresolved_friction):
+                message = check(problem, float(dt0))
+                if message is not None:
+                    warnings.warn(message, stacklevel=2)
         warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
         if has_kinks(problem):
             _warn_of_law(estimate, problem, key, devices)

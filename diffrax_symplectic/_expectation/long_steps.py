@@ -1,5 +1,6 @@
-"""Whether steps are too long for an explicit solver, where paths start."""
+"""Whether steps are too long for a solver, for the state in which paths start."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
@@ -13,7 +14,14 @@ from jaxtyping import Array, Bool, Float, PyTree
 from .._compat import quickly_compiled
 from .._simulation import Problem
 from .._solver import AbstractSymplecticSolver
-from .._terms import brownian_paths, constraint_of, has_unknown_law
+from .._terms import (
+    brownian_paths,
+    constraint_of,
+    Dependence,
+    has_unknown_law,
+    rate,
+    split_friction,
+)
 
 
 # A step that enlarges a small change of the state by more than this, and turns it around,
@@ -24,42 +32,106 @@ _UNSTABLE = 1.1
 # After this many steps of the tangent flow any change of the state points in the most
 # unstable direction. Its growth is measured over as many more steps.
 _ITERATIONS = 50
+# The same for the square of the largest frequency, which need not be known as well.
+_ITERATIONS_FOR_FREQUENCY = 15
 # The part of `dt0` that is surely short enough. If such a step fails, too, the length of
 # steps is not the cause.
 _SHORT = 1e-6
+# The number of steps to look at where the drift depends on time.
+_NUM_TIMES = 64
+# Multiples of this number, without their whole parts, fill an interval evenly, and a drift
+# that is periodic in time does not repeat in step with them.
+_GOLDEN_RATIO = (1 + 5**0.5) / 2
 
 
 class _Growth(NamedTuple):
-    """How a small change of the state grows in steps that are all taken from one state.
+    """How a linear map enlarges a change of the state, applied to it again and again.
 
     - `change`: the change, scaled to length one.
-    - `log_growth`: the logarithm of the factor by which it grew in the steps that count.
-    - `along_itself`: the scalar product of the change after the last step with the one
-        before it. It is negative if the step turned the change around.
+    - `log_growth`: the logarithm of the factor by which it grew each time, in the mean over
+        the times that count.
+    - `along_itself`: the scalar product of the change after the last time with the one
+        before it. It is negative if the map turned the change around.
     """
 
-    change: Float[Array, " n"]
-    log_growth: Float[Array, ""]
-    along_itself: Float[Array, ""]
+    change: Float[Array, "*times n"]
+    log_growth: Float[Array, "*times"]
+    along_itself: Float[Array, "*times"]
 
 
-def is_unstable_at_start(problem: Problem) -> bool:
-    """Whether an explicit solver of this package is unstable at the start of a path, with
-    steps of `dt0` and increments of zero. Two levels need not show it: where forces are
-    bounded, steps of `dt0` and half of it may both leave a random state.
+def too_long_steps(problem: Problem, dt0: float) -> str | None:
+    """What is wrong with steps of `dt0` for the state in which paths start, as a sentence;
+    `None` if nothing is, or for solvers of others. Two levels need not show it.
+
+    Explicit solvers must be stable, with increments of zero. A solver with a
+    `Record.most_frequency` must resolve the frequencies of the drift. If the drift depends
+    on time, this looks at steps from all over the interval, and otherwise at the first.
 
     This sees the frequencies at `y0` alone. To look at the states of a path without noise,
     too, would not find the usual case: on an ellipse of eccentricity 0.8 steps of a
     thirtieth of the period jump over the nearest point, where they are too long, and the
     states on either side of it look stable."""
-    if not isinstance(problem.solver, AbstractSymplecticSolver):
-        return False
-    if not _is_explicit(problem) or not _has_step_without_noise(problem):
-        return False
-    growth = _quick_growth(problem)
-    grows = growth.log_growth > _ITERATIONS * np.log(_UNSTABLE)
-    turns_around = growth.along_itself < 0
-    return bool(grows and turns_around)
+    solver = problem.solver
+    if not isinstance(solver, AbstractSymplecticSolver):
+        return None
+    if not _has_step_without_noise(problem):
+        return None
+    name = type(solver).__name__
+    if _is_explicit(problem):
+        numbers = _numbers_of_steps(problem)
+        growth = _quick_growth(problem, numbers)
+        is_unstable = growth.log_growth > np.log(_UNSTABLE)
+        is_unstable &= growth.along_itself < 0
+        if not np.any(is_unstable):
+            return None
+        place = _place(problem, numbers[np.argmax(is_unstable)])
+        return (
+            f"Steps of `dt0={dt0:g}` are too long for `{name}` {place}: a small change of "
+            "the state grows in each step, with alternating signs. Where forces are "
+            "bounded, such steps leave random states, and two levels may agree on a wrong "
+            "mean. Pass a smaller `dt0`."
+        )
+    most = None if solver.record is None else solver.record.most_frequency
+    if most is None:
+        return None
+    numbers = _numbers_of_steps(problem)
+    angles = np.asarray(_quick_frequencies(problem, numbers)) * dt0
+    largest = np.argmax(angles)
+    if not angles[largest] > most:
+        return None
+    place = _place(problem, numbers[largest])
+    return (
+        f"Steps of `dt0={dt0:g}` are too long for `{name}` {place}: omega h = "
+        f"{angles[largest]:.3g} for the largest frequency of the drift, and with omega h > "
+        f"{most:g} two levels may agree on a wrong mean. Pass a smaller `dt0`, or "
+        "`levels=3`, which checks the order."
+    )
+
+
+def _numbers_of_steps(problem: Problem) -> Float[np.ndarray, " times"]:
+    """The numbers of the steps to look at: the first alone if the drift does not depend on
+    time."""
+    drift, _, _ = split_friction(problem.terms)
+    if not drift:
+        return np.zeros(1, problem.dtype)
+
+    def rate_of_drift(t: Array, y: PyTree[Array]) -> PyTree[Array]:
+        return rate(drift, t, y, problem.args)
+
+    dependence = Dependence(rate_of_drift, problem.t0, problem.y0)
+    if dependence.independent(lambda t, y: t):
+        return np.zeros(1, problem.dtype)
+    fractions = np.arange(_NUM_TIMES) * _GOLDEN_RATIO % 1
+    num_steps = int(problem.level(0).num_steps)
+    return np.floor(fractions * num_steps).astype(problem.dtype)
+
+
+def _place(problem: Problem, number: float) -> str:
+    """Where a step begins, for messages."""
+    if number == 0:
+        return "where paths start"
+    t = float(problem.t0) + number * float(problem.level(0).h)
+    return f"at t = {t:.4g}, for the state in which paths start"
 
 
 def may_be_too_long(problem: Problem) -> bool:
@@ -102,33 +174,88 @@ def _short_step_succeeds(problem: Problem) -> Bool[Array, ""]:
     return success & jnp.all(jnp.isfinite(problem.values(problem.t0, y)))
 
 
-def _growth(problem: Problem) -> _Growth:
-    """The growth of the change that a step from `y0` enlarges most, by power iteration with
-    the derivative of the step."""
+def _growth(problem: Problem, numbers: Float[Array, " times"]) -> _Growth:
+    """The growth of the change that a step from `y0` enlarges most, by the derivative of
+    the step; for the steps with these numbers."""
     h = problem.level(0).h
     terms = _terms_without_noise(problem, h)
     flat_y0, unravel = jfu.ravel_pytree(problem.y0)
 
-    def step(x: Array) -> Array:
-        y = unravel(x)
-        y1, *_ = problem.step(terms, 0, h, y, problem.init(terms, 0, h, y))
-        return jfu.ravel_pytree(y1)[0]
+    def growth_in_step(number: Float[Array, ""]) -> _Growth:
+        def step(x: Array) -> Array:
+            y = unravel(x)
+            state = problem.init(terms, number, h, y)
+            y1, *_ = problem.step(terms, number, h, y, state)
+            return jfu.ravel_pytree(y1)[0]
 
-    def after_step(number: Array, before: _Growth) -> _Growth:
-        _, change = jax.jvp(step, (flat_y0,), (before.change,))
-        # The change before the step has length one, so this is its growth.
+        def derivative(change: Array) -> Array:
+            return jax.jvp(step, (flat_y0,), (change,))[1]
+
+        return _largest_growth(derivative, flat_y0, _ITERATIONS)
+
+    # This compiles faster than `jax.vmap`, and takes less memory.
+    return lax.map(growth_in_step, numbers)
+
+
+def _frequencies(
+    problem: Problem, numbers: Float[Array, " times"]
+) -> Float[Array, " times"]:
+    """The largest angular frequency of the drift without friction at `y0`, at the starts of
+    the steps with these numbers; zero where growth without oscillation is faster."""
+    h = problem.level(0).h
+    drift, _, _ = split_friction(problem.terms)
+    if not drift:
+        return jnp.zeros_like(numbers)
+    flat_y0, unravel = jfu.ravel_pytree(problem.y0)
+
+    def frequency(number: Float[Array, ""]) -> Float[Array, ""]:
+        t = problem.t0 + number * h
+
+        def rate_of_drift(x: Array) -> Array:
+            dy = rate(drift, t, unravel(x), problem.args)
+            return jfu.ravel_pytree(dy)[0]
+
+        def derivative(_, change: Array) -> Array:
+            return jax.jvp(rate_of_drift, (flat_y0,), (change,))[1]
+
+        # An oscillation has a pair of eigenvalues, i omega and -i omega. Applied twice, the
+        # derivative has -omega^2 in the whole plane of the oscillation. (In a loop, it is
+        # compiled once.)
+        def derivative_twice(change: Array) -> Array:
+            return lax.fori_loop(0, 2, derivative, change)
+
+        growth = _largest_growth(derivative_twice, flat_y0, _ITERATIONS_FOR_FREQUENCY)
+        oscillates = growth.along_itself < 0
+        return jnp.where(oscillates, jnp.exp(growth.log_growth / 2), 0)
+
+    return lax.map(frequency, numbers)
+
+
+def _largest_growth(
+    linear: Callable[[Array], Array], like: Float[Array, " n"], iterations: int
+) -> _Growth:
+    """The growth of the change that a linear map enlarges most, by power iteration: after
+    this many applications of the map, over as many more."""
+
+    def after_map(number: Array, before: _Growth) -> _Growth:
+        change = linear(before.change)
+        # The change before the map has length one, so this is its growth.
         length = jnp.linalg.norm(change)
-        counted_log = jnp.where(number < _ITERATIONS, 0.0, jnp.log(length))
+        counted_log = jnp.where(number < iterations, 0.0, jnp.log(length))
+        log_growth = before.log_growth + counted_log / iterations
         along_itself = before.change @ change
-        return _Growth(change / length, before.log_growth + counted_log, along_itself)
+        # Without a drift, as between two pulses, nothing is left of a change.
+        scaled = jnp.where(length > 0, change / length, before.change)
+        return _Growth(scaled, log_growth, along_itself)
 
     # An arbitrary direction, without the symmetries that a problem may have: it contains
-    # the most unstable one.
-    direction = jnp.cos(1.0 + jnp.arange(flat_y0.size, dtype=flat_y0.dtype))
-    zero = jnp.zeros((), flat_y0.dtype)
+    # the one that grows most.
+    direction = jnp.cos(1.0 + jnp.arange(like.size, dtype=like.dtype))
+    zero = jnp.zeros((), like.dtype)
     start = _Growth(direction / jnp.linalg.norm(direction), zero, zero)
-    return lax.fori_loop(0, 2 * _ITERATIONS, after_step, start)
+    return lax.fori_loop(0, 2 * iterations, after_map, start)
 
 
 _quick_growth = quickly_compiled(_growth)
+_quick_frequencies = quickly_compiled(_frequencies)
 _quick_short_step_succeeds = quickly_compiled(_short_step_succeeds)

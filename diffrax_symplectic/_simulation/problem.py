@@ -312,6 +312,14 @@ class Problem(eqx.Module):
         return all(has_bounded_increments(path) for path in brownian_paths(self.terms))
 
     @property
+    def is_implicit(self) -> bool:
+        """Whether the solver is known to solve equations in a step."""
+        solver = self.solver
+        if isinstance(solver, AbstractSymplecticSolver):
+            return len(solver.stage_vectors(1)) > 0
+        return isinstance(solver, diffrax.AbstractImplicitSolver)
+
+    @property
     def dtype_of_values(self) -> Any:
         """The dtype of `values`."""
         return jax.eval_shape(lambda: self.values(self.t0, self.y0)).dtype
@@ -346,13 +354,22 @@ def _truncated_where_needed(
     return truncated_in_unit(terms, is_made_by_solver, unit)
 
 
-def advice_on_failures(has_bounded_increments: bool) -> str:
-    """What to do about failed paths, in a sentence for messages. The argument is whether
-    the increments of all paths are known to be bounded."""
+def advice_on_failures(has_bounded_increments: bool, is_implicit: bool) -> str:
+    """What to do about failed paths, in sentences for messages. The arguments are whether
+    the increments of all paths are known to be bounded, and whether the solver is known to
+    be implicit."""
+    no_solution = ""
+    if is_implicit:
+        no_solution = (
+            "The equations of an implicit step may have no solution, for example where "
+            "particles meet: pass a smaller `dt0`, or an explicit solver. If they are only "
+            "hard, pass `root_finder=PicardNewton(newton_steps=1000)` to the solver. "
+        )
     alternative = ""
     if not has_bounded_increments:
         alternative = " or bounded increments, as from a `WeakBrownianPath`,"
     return (
+        f"{no_solution}"
         f"Take smaller steps{alternative} and look for NaNs in `y0`, `args` and the "
         "Hamiltonians, and for a `temperature` or `friction` that is negative or, as a "
         "matrix, not symmetric positive semidefinite."

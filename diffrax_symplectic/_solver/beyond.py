@@ -62,12 +62,18 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     record: ClassVar[Record] = Record(
         weak=(2, 1),
         strong=None,
-        choose="For accurate expectations: four stage vectors in three small systems. "
-        "Not for long steps, omega h > 1.",
+        choose="For accurate expectations: four stage vectors in three small systems.",
         noises="commuting",
         suggested=("weak",),
         right_energy_unresolved=True,
         most_friction=0.5,
+        # With two levels, the share of means that were off by more than two error bars, for
+        # all phases of a Kubo oscillator with noise 0.27 (p^2 + q^2) / 2 in units of omega:
+        # 1, 3, 11, 19 and 36% for omega h = 0.5, 1, 1.5, 2 and 3 up to the time 30 / omega;
+        # 4, 14, 31, 54 and 73% up to 100 / omega. Three levels of a quantum system, coupled
+        # by pulses: 3 of 36 populations for omega h up to 1.1, where one, between changes
+        # of opposite signs, was off by 3.8; 21 of 36 for 2 and more, by up to 27.
+        most_frequency=1.0,
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau(
         alpha=_HALVES,

@@ -26,8 +26,10 @@ class Record(NamedTuple):
         stationary energies of a resolved harmonic mode in a heat bath are within a tenth,
         of those in `examples/stability/friction.py`; `None` if there is no limit. Given
         for suggested solvers.
+    - `most_frequency`: the largest frequency of the drift, as omega h, up to which two
+        levels were measured to hold their error bars; `None` if nothing is promised.
 
-    The last three are measured, in `tests/test_advice.py`, for the solvers that are
+    The last four are measured, in `tests/test_advice.py`, for the solvers that are
     `suggested`. Leave them out for others: the page then promises and warns of nothing.
     The random variables of `LevyAreaMidpoint` have no finite set of outcomes, so it states
     those of the midpoint rule, which a test compares its steps with.
@@ -41,12 +43,16 @@ class Record(NamedTuple):
     stationary: tuple[str, ...] = ()
     right_energy_unresolved: bool | None = None
     most_friction: float | None = None
+    most_frequency: float | None = None
 
     @property
     def reason(self) -> str:
-        """When to choose it, and its limits by `right_energy_unresolved` and
-        `most_friction`, in sentences for users."""
+        """When to choose it, and its limits by `most_frequency`,
+        `right_energy_unresolved` and `most_friction`, in sentences for users."""
         sentences = [self.choose]
+        if self.most_frequency is not None:
+            limit = f"{self.most_frequency:g}"
+            sentences.append(f"Not for long steps, omega h > {limit}.")
         # If stationary momenta are exact, a heat bath corrects the energy.
         if self.right_energy_unresolved is False and "pp" in self.stationary:
             sentences.append("If noise drives stiff modes, only in a heat bath.")

@@ -1,4 +1,4 @@
-"""Explicit steps beyond their limit are told where two levels agree on a wrong mean."""
+"""Steps that are too long are told where two levels agree on a wrong mean."""
 
 import warnings
 
@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation.long_steps import too_long_steps
+from diffrax_symplectic._simulation import Problem
 
 
 Y0 = jnp.array(0.0), jnp.array(1.0)
@@ -116,6 +118,120 @@ def test_the_warning_names_the_line_of_the_user():
     assert {x.filename for x in told if "too long" in str(x.message)} == {__file__}
 
 
+def _pulse(t, center, strength):
+    return strength * jnp.exp(-((t - center) ** 2))
+
+
+def _coupled_by_pulses(t, psi, strength):
+    """Three levels, none of which is coupled to another at the start."""
+    c = jnp.conj(psi)
+    first = _pulse(t, 3.5, strength) * c[0] * psi[1]
+    second = _pulse(t, 2.5, strength) * c[1] * psi[2]
+    return jnp.real(first + second)
+
+
+def _exact_population(strength, num_steps=3000):
+    """Of the third level at time 6, by exact steps of the matrix at their midpoints."""
+    h = 6 / num_steps
+    psi = np.array([1.0, 0.0, 0.0], complex)
+    for step in range(num_steps):
+        t = (step + 0.5) * h
+        matrix = np.zeros((3, 3))
+        matrix[0, 1] = matrix[1, 0] = strength * np.exp(-((t - 3.5) ** 2)) / 2
+        matrix[1, 2] = matrix[2, 1] = strength * np.exp(-((t - 2.5) ** 2)) / 2
+        values, vectors = np.linalg.eigh(matrix)
+        psi = vectors @ (np.exp(-1j * h * values) * (vectors.T @ psi))
+    return abs(psi[2]) ** 2
+
+
+def test_pulses_that_two_levels_do_not_resolve_are_told_with_their_time():
+    # The noise is too weak to matter, so that all of the error is of the steps.
+    noise = lambda t, psi, strength: 1e-6 * jnp.real(psi[2] * jnp.conj(psi[2]))
+    terms = ds.wave_terms(_coupled_by_pulses, noise, ())
+    population = lambda t, y, strength: jnp.sum(jnp.stack(y)[:, 2] ** 2) / 2
+    y0 = ds.to_pair(jnp.array([1.0, 0.0, 0.0]) + 0j)
+    given = population, terms, ds.StrangGauss(), 0, 6, 0.1, y0, jnp.array(60.0)
+    few = ds.IndependentPaths(8)
+    with pytest.warns(
+        UserWarning, match=r"too long .* t = 3.*: omega h = 3.3 "
+    ) as told:
+        got = ds.expectation(*given, key=jr.key(1), sampling=few)
+    assert abs(got.mean - _exact_population(60.0)) > 10 * got.error
+    assert {x.filename for x in told if "too long" in str(x.message)} == {__file__}
+
+
+def _fault(terms, solver, h, y0, args=None, num_steps=100):
+    """What `expectation` says of long steps, without its samples."""
+    phi = lambda t, y, args: jnp.sum(y[1])
+    t1 = num_steps * h
+    problem = Problem.of(phi, terms, solver, 0.0, t1, h, y0, args, None, levels=2)
+    return too_long_steps(problem, h)
+
+
+MASSES = jnp.array([2.0, 0.5, 4.0])
+STIFFNESS = jnp.array([[4.0, 1.0, 0.0], [1.0, 3.0, 0.5], [0.0, 0.5, 2.0]])
+THREE = jnp.zeros(3), jnp.ones(3)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
+def test_strang_gauss_is_told_beyond_the_frequency_of_its_record(scale):
+    # In any unit of time.
+    def bonds(t, p, q, args):
+        return jnp.sum(p**2 / MASSES) / 2 + q @ STIFFNESS @ q / (2 * scale**2)
+
+    noise = lambda t, p, q, args: q[0] / scale**2
+    terms = ds.hamiltonian_terms(bonds, noise, ())
+    frequency = np.sqrt(np.max(np.linalg.eigvals(STIFFNESS / MASSES[:, None]).real))
+    most = ds.StrangGauss().record.most_frequency
+    for factor, too_long in ((0.5, False), (0.95, False), (1.05, True)):
+        h = factor * most / frequency * scale
+        message = _fault(terms, ds.StrangGauss(), h, THREE)
+        assert (message is not None) == too_long
+    assert f"omega h = {factor * most:.3g} for" in message
+    # The midpoint rule has honest bars, as three levels do.
+    assert _fault(terms, ds.ImplicitMidpoint(), h, THREE) is None
+
+
+def test_what_does_not_oscillate_is_not_told_of_frequencies():
+    solver = ds.StrangGauss()
+    noise = lambda t, p, q, args: q[0]
+    free = ds.hamiltonian_terms(lambda t, p, q, args: jnp.sum(p**2) / 2, noise, ())
+    still = ds.hamiltonian_terms(lambda t, p, q, args: 0.0, noise, ())
+    barrier = ds.hamiltonian_terms(
+        lambda t, p, q, args: jnp.sum(p**2 - q**2) / 2, noise, ()
+    )
+    rough = ds.langevin_terms(
+        lambda t, p, q, args: jnp.sum(p**2 + q**2 / 100) / 2, 50.0, 1.0, (3,)
+    )
+    for terms in (free, still, barrier, rough):
+        assert _fault(terms, solver, 5.0, THREE) is None
+
+
+@pytest.mark.parametrize("solver", [ds.StrangGauss(), ds.StormerVerlet()])
+def test_a_ramp_is_told_where_it_ends_up_too_stiff(solver):
+    def ramped(t, p, q, args):
+        return jnp.sum(p**2) / 2 + (1 + args * t) * (1 - jnp.cos(q[0]))
+
+    terms = ds.hamiltonian_terms(ramped, lambda t, p, q, args: q[0] / 5, ())
+    # 100 steps of 0.1, to frequencies of 5 and 33.
+    y0 = jnp.zeros(1), jnp.zeros(1)
+    assert _fault(terms, solver, 0.1, y0, args=jnp.array(2.4)) is None
+    assert "too long" in _fault(terms, solver, 0.1, y0, args=jnp.array(110.0))
+
+
+def test_a_periodic_drift_is_seen_whatever_its_period():
+    def pulsed(t, p, q, args):
+        within = (t / args) % 1
+        return jnp.sum(p**2) / 2 + jnp.where(within > 0.8, 400.0, 0.0) * q @ q / 2
+
+    terms = ds.hamiltonian_terms(pulsed, lambda t, p, q, args: q[0], ())
+    y0 = jnp.zeros(1), jnp.zeros(1)
+    for num_periods in (1, 8, 16, 32, 64, 100):
+        period = jnp.array(1000 * 0.1 / num_periods)
+        message = _fault(terms, ds.StrangGauss(), 0.1, y0, period, num_steps=1000)
+        assert "omega h = 2 " in message
+
+
 def _stiff(t, p, q, args):
     return p**2 / 2 + 200 * q**4
 
@@ -142,3 +258,24 @@ def test_a_run_in_which_all_paths_fail_names_the_step(solver):
 def test_a_hamiltonian_that_is_not_finite_is_not_blamed_on_the_step():
     singular = lambda t, p, q, args: p**2 / 2 + jnp.sqrt(q - 2)
     assert "Most likely" not in _failures(singular, ds.StormerVerlet(), 0.5)
+
+
+def _meeting(t, p, q, args):
+    """Two vortices, whose velocities grow without limit where they meet."""
+    squared_distance = (p[0] - p[1]) ** 2 + (q[0] - q[1]) ** 2
+    return -2 * jnp.log(squared_distance)
+
+
+def test_implicit_steps_without_a_solution_are_named_where_paths_fail():
+    apart = jnp.zeros(2), jnp.array([0.5, -0.5])
+    scattered = lambda t, p, q, args: 0.8 * jnp.concatenate([p, -q])
+    phi = lambda t, y, args: y[1][0]
+    terms = ds.hamiltonian_terms(_meeting, scattered, (4,))
+    given = phi, terms, ds.ImplicitMidpoint(), 0, 2, 0.2, apart
+    with pytest.warns(UserWarning, match="paths failed") as told:
+        ds.expectation(*given, key=jr.key(1), sampling=ds.IndependentPaths(200))
+    (message,) = [str(x.message) for x in told if "paths failed" in str(x.message)]
+    assert "an implicit step may have no solution" in message
+    assert "pass a smaller `dt0`, or an explicit solver" in message
+    assert "root_finder=PicardNewton" in message
+    assert "implicit step" not in _failures(_stiff, ds.StormerVerlet(), 0.5)

@@ -105,6 +105,15 @@ def test_of_failed_paths():
     here(follow(terms, ds.StormerVerlet(), 4, 0.25), "of 60 paths failed")
 
 
+def test_of_implicit_steps_without_a_solution():
+    # dq/dt = q^2 has no midpoint step from q = 1 that is longer than 1/2.
+    explosive = lambda t, p, q, args: p * q**2
+    weak = lambda t, p, q, args: 0.01 * q
+    terms = ds.hamiltonian_terms(explosive, weak, ())
+    few = follow(terms, ds.ImplicitMidpoint(), 0.9, 0.9)
+    here(few, "an implicit step may have no solution")
+
+
 @needs_drjit
 def test_of_stragglers():
     stiff = lambda t, p, q, args: p**2 / 2 + 20 * q**4

@@ -33,12 +33,17 @@ _MANY_MORE = 10
 
 
 def cautions(
-    estimate: Expectation, tol: float | None, bounded: bool, cause: str = ""
+    estimate: Expectation,
+    tol: float | None,
+    bounded: bool,
+    implicit: bool = False,
+    cause: str = "",
 ) -> Iterator[str]:
     """The warnings for an estimate. `bounded` is whether the increments of all paths are
-    known to be bounded, `cause` a sentence on why paths failed, if that is known."""
+    known to be bounded, `implicit` whether the solver is known to be implicit, `cause` a
+    sentence on why paths failed, if that is known."""
     if estimate.num_failed > 0:
-        yield from _cautions_on_failures(estimate, bounded, cause)
+        yield from _cautions_on_failures(estimate, bounded, implicit, cause)
     if estimate.num_samples > 1:
         yield from _cautions_on_mean(estimate)
         yield from _cautions_on_samples(estimate)
@@ -48,7 +53,7 @@ def cautions(
 
 
 def _cautions_on_failures(
-    estimate: Expectation, bounded: bool, cause: str
+    estimate: Expectation, bounded: bool, implicit: bool, cause: str
 ) -> Iterator[str]:
     """Warns of failed paths that could change the mean by more than its standard error."""
     changes = jtu.tree_leaves(estimate.failed_error)
@@ -71,7 +76,7 @@ def _cautions_on_failures(
                 f"; the first two steps do not agree, since {num_with_dt0:,} paths fail "
                 f"with steps of `dt0` and {num_with_half:,} with half of it"
             )
-    advice = advice_on_failures(bounded)
+    advice = advice_on_failures(bounded, implicit)
     yield f"{estimate.num_failed:,} paths failed: {consequence}. {cause}{advice}"
 
 
