@@ -37,6 +37,7 @@ from .estimate import (
     needs_level,
 )
 from .fused_paths import FusedPaths
+from .jumps import jumping_forces
 from .kinks import has_kinks
 from .long_steps import is_unstable_at_start, may_be_too_long
 from .run import Meter, NO_METER, run
@@ -167,8 +168,8 @@ def expectation(
     all samples are equal or underflow, if a fit was dropped or takes long, and if `phi` is
     not smooth and a trial with Gaussian increments has another mean than discrete ones. Of
     the steps: if two levels do not agree, if steps at `y0` are too long for an explicit
-    solver or for the friction, and if rounding in single precision may exceed the standard
-    error.
+    solver or for the friction, if the forces of `BAOAB` jump at the end of a step, and
+    if rounding in single precision may exceed the standard error.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and
@@ -232,9 +233,10 @@ def expectation(
                 stacklevel=2,
             )
         if estimate.levels == 2:
-            message = unresolved_friction(problem, float(dt0))
-            if message is not None:
-                warnings.warn(message, stacklevel=2)
+            of_friction = unresolved_friction(problem, float(dt0))
+            for message in (of_friction, jumping_forces(problem)):
+                if message is not None:
+                    warnings.warn(message, stacklevel=2)
         warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
         if has_kinks(problem):
             _warn_of_law(estimate, problem, key, devices)
