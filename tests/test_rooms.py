@@ -29,7 +29,7 @@ FLOORS = [
 # Of the folders and modules in `_expectation`.
 FLOORS_OF_EXPECTATION = [
     ("sampling",),
-    ("estimate", "batch", "cost", "kinks", "long_steps", "strong_friction"),
+    ("estimate", "batch", "cost", "jumps", "kinks", "long_steps", "strong_friction"),
     ("run", "call"),
     ("independent", "fitted", "sorted"),
     ("fused_paths",),

@@ -5,7 +5,8 @@ In the order of a call of `expectation`:
 - `expectation`, `monte_carlo`: the functions; `call`: what they check alike.
 - `choose`: the sampling, if the user did not choose one, by `cost`, what a step costs, and
   `kinks`, whether `phi` is smooth; `long_steps`, whether steps are too long at `y0`;
-  `strong_friction`, whether steps resolve the friction.
+  `strong_friction`, whether steps resolve the friction; `jumps`, whether forces jump at
+  their ends.
 - `sampling`: what a sampling is. It makes a plan of how samples are taken.
 - `independent`, `sorted/`, `fitted/`: the samplings. Each simulates its paths by the loop
   over steps of `_simulation`; `fused_paths`: independent ones from a fused kernel.

@@ -37,6 +37,7 @@ from .estimate import (
     needs_level,
 )
 from .fused_paths import FusedPaths
+from .jumps import jumping_forces
 from .kinks import has_kinks
 from .long_steps import may_be_too_long, too_long_steps
 from .run import Meter, NO_METER, run
@@ -167,8 +168,9 @@ def expectation(
     all samples are equal or underflow, if a fit was dropped or takes long, and if `phi` is
     not smooth and a trial with Gaussian increments has another mean than discrete ones. Of
     the steps: if two levels do not agree, if steps are too long at `y0` for an explicit
-    solver, for [`diffrax_symplectic.StrangGauss`][] or for the friction, and if rounding in
-    single precision may exceed the standard error.
+    solver, for [`diffrax_symplectic.StrangGauss`][] or for the friction, if the forces of
+    `BAOAB` jump at the end of a step, and if rounding in single precision may exceed the
+    standard error.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and
@@ -226,8 +228,9 @@ def expectation(
         # With three levels the order is checked, which shows such steps. With one level the
         # result does not claim to include the discretization error.
         if estimate.levels == 2:
-            for check in (too_long_steps, unresolved_friction):
-                message = check(problem, float(dt0))
+            of_steps = too_long_steps(problem, float(dt0))
+            of_friction = unresolved_friction(problem, float(dt0))
+            for message in (of_steps, of_friction, jumping_forces(problem)):
                 if message is not None:
                     warnings.warn(message, stacklevel=2)
         warn_of_truncation(problem.terms, float(dt0), stacklevel=2)

@@ -28,7 +28,7 @@ from .separable import SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet, PlateauVerlet
 from .additive import SRKs4, SRKw5, AdditiveGauss
 from .langevin import AbstractLangevinSplitting, BAOAB, LangevinMiddle
 from .splitting import LinearFlow
-from .flow import is_solver
+from .flow import is_solver, kicks_and_rest
 from .linear_flow import linear_flow
 from .paths import common_path, own_path
 from .root_finders import with_changed_stages, without_newton
