@@ -2,6 +2,7 @@
 
 import warnings
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -176,3 +177,36 @@ def test_flips_at_random_times_are_within_steps():
 
     sampling = ds.IndependentPaths(64)
     assert not _is_told(energy, ds.BAOAB(), 0.25, args=flips, sampling=sampling)
+
+
+def _hanging(t, p, q, args):
+    return jnp.sum(p**2) / 2 + _quench(t) * q[1]
+
+
+def _free(t, p, q, args):
+    return jnp.sum(p**2) / 2
+
+
+def _switched_on(t, y, args):
+    return jnp.where(t < 1, 0.0, 1.0) * jnp.ones(2), jnp.zeros(2)
+
+
+ROD = ds.langevin_terms(
+    _hanging,
+    0.5,
+    1.0,
+    (2,),
+    constraint=lambda q, args: jnp.sum(q**2, keepdims=True) - 1,
+)
+PUSHED = diffrax.MultiTerm(
+    *ds.langevin_terms(_free, 0.5, 1.0, (2,)).terms, diffrax.ODETerm(_switched_on)
+)
+
+
+@pytest.mark.parametrize("terms", [ROD, PUSHED], ids=["constraint", "further term"])
+def test_forces_under_a_constraint_or_in_a_further_term_are_told(terms):
+    y0 = jnp.zeros(2), jnp.array([0.0, -1.0])
+    with pytest.warns(UserWarning, match="jump at step ends, such as t=1,"):
+        ds.expectation(
+            _square, terms, ds.BAOAB(), 0, 2, 0.1, y0, key=jr.key(0), sampling=FEW
+        )
