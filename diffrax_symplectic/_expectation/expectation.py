@@ -39,7 +39,7 @@ from .estimate import (
 from .fused_paths import FusedPaths
 from .jumps import jumping_forces
 from .kinks import has_kinks
-from .long_steps import may_be_too_long, too_long_steps
+from .long_steps import may_be_too_long, too_long_steps, unresolved_noise
 from .run import Meter, NO_METER, run
 from .sampling import AbstractSampling
 from .strong_friction import unresolved_friction
@@ -168,9 +168,9 @@ def expectation(
     all samples are equal or underflow, if a fit was dropped or takes long, and if `phi` is
     not smooth and a trial with Gaussian increments has another mean than discrete ones. Of
     the steps: if two levels do not agree, if steps are too long at `y0` for an explicit
-    solver, for [`diffrax_symplectic.StrangGauss`][] or for the friction, if the forces of
-    `BAOAB` jump at the end of a step, and if rounding in single precision may exceed the
-    standard error.
+    solver, for [`diffrax_symplectic.StrangGauss`][], for the noise or for the friction, if
+    the forces of `BAOAB` jump at the end of a step, and if rounding in single precision may
+    exceed the standard error.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and
@@ -229,8 +229,10 @@ def expectation(
         # result does not claim to include the discretization error.
         if estimate.levels == 2:
             of_steps = too_long_steps(problem, float(dt0))
+            of_noise = unresolved_noise(problem, float(dt0))
             of_friction = unresolved_friction(problem, float(dt0))
-            for message in (of_steps, of_friction, jumping_forces(problem)):
+            of_jumps = jumping_forces(problem)
+            for message in (of_steps, of_noise, of_friction, of_jumps):
                 if message is not None:
                     warnings.warn(message, stacklevel=2)
         warn_of_truncation(problem.terms, float(dt0), stacklevel=2)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation.long_steps import too_long_steps
+from diffrax_symplectic._expectation.long_steps import too_long_steps, unresolved_noise
 from diffrax_symplectic._simulation import Problem
 
 
@@ -279,3 +279,64 @@ def test_implicit_steps_without_a_solution_are_named_where_paths_fail():
     assert "pass a smaller `dt0`, or an explicit solver" in message
     assert "root_finder=PicardNewton" in message
     assert "implicit step" not in _failures(_stiff, ds.StormerVerlet(), 0.5)
+
+
+def _hops(t, psi, args):
+    return 2 * jnp.sum(jnp.real(jnp.conj(psi[:-1]) * psi[1:]))
+
+
+def _sites(t, psi, args):
+    return jnp.sqrt(args) * jnp.real(psi * jnp.conj(psi))
+
+
+@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), ds.StrangGauss()])
+def test_noise_that_steps_do_not_resolve_is_told(solver):
+    # The mean square of the site of an exciton that starts at one end of three sites with
+    # white noise. The exact value is that of the Lindblad equation with the rate 10.
+    terms = ds.wave_terms(_hops, _sites, (3,))
+    y0 = ds.to_pair(jnp.eye(3)[0] + 0j)
+
+    def squared_site(t, y, args):
+        psi = ds.from_pair(y)
+        return jnp.arange(3.0) ** 2 @ jnp.real(psi * jnp.conj(psi))
+
+    with pytest.warns(
+        UserWarning, match="do not resolve the noise.* by 3.16 in a step"
+    ):
+        estimate = ds.expectation(
+            squared_site, terms, solver, 0, 4, 1.0, y0, 10.0, key=jr.key(0),
+            sampling=ds.IndependentPaths(16_384),
+        )  # fmt: skip
+    assert abs(estimate.mean - 0.793187) > 3 * estimate.error
+
+
+def _noise_told(terms, y0, h, args=None):
+    """What is said of the noise, by the midpoint rule in steps of `h`."""
+    phi = lambda t, y, args: jnp.sum(y[1])
+    problem = Problem.of(
+        phi, terms, ds.ImplicitMidpoint(), 0, 4 * h, h, y0, args, None, 2
+    )
+    return unresolved_noise(problem, h)
+
+
+@pytest.mark.parametrize("rate, told", [(2.0, False), (3.0, True)])
+def test_the_limit_of_noise_is_an_angle_of_one_step(rate, told):
+    # Each of the noises turns its own site: their number does not matter.
+    for sites in (1, 3, 40):
+        terms = ds.wave_terms(_hops, _sites, (sites,))
+        y0 = ds.to_pair(jnp.ones(sites) + 0j)
+        for h in (1.0, 1e-3):
+            assert (_noise_told(terms, y0, h, rate / h) is not None) is told
+
+
+def test_noise_that_turns_nothing_is_always_resolved():
+    one = jnp.zeros(1), jnp.ones(1)
+    oscillator = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2
+    forces = lambda t, p, q, args: -100.0 * jnp.sum(q)
+    springs = lambda t, p, q, args: 100.0 * jnp.sum(q**2)
+    for noise in (forces, springs):
+        assert (
+            _noise_told(ds.hamiltonian_terms(oscillator, noise, ()), one, 1.0) is None
+        )
+    bath = ds.langevin_terms(oscillator, 100.0, 10.0, (1,))
+    assert _noise_told(bath, one, 1.0) is None
