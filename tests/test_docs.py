@@ -166,7 +166,10 @@ def test_links_of_readme_lead_somewhere():
     links = re.findall(r"\]\((docs/.*?)\)", (ROOT / "README.md").read_text())
     assert len(links) > 5
     for link in links:
-        assert (ROOT / link).exists(), link
+        page, _, anchor = link.partition("#")
+        assert (ROOT / page).exists(), link
+        headings = re.findall("^#+ (.*)$", (ROOT / page).read_text(), re.M)
+        assert anchor in ["", *(x.lower().replace(" ", "-") for x in headings)], link
 
 
 def test_docs_describe_every_public_name():
