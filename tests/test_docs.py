@@ -168,8 +168,9 @@ def test_links_of_readme_lead_somewhere():
     for link in links:
         page, _, anchor = link.partition("#")
         assert (ROOT / page).exists(), link
-        headings = re.findall("^#+ (.*)$", (ROOT / page).read_text(), re.M)
-        assert anchor in ["", *(x.lower().replace(" ", "-") for x in headings)], link
+        if anchor:
+            headings = re.findall("^#+ (.*)$", (ROOT / page).read_text(), re.M)
+            assert anchor in [x.lower().replace(" ", "-") for x in headings], link
 
 
 def test_docs_describe_every_public_name():
