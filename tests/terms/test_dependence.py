@@ -254,3 +254,10 @@ def test_arrays_of_a_tree_that_mix_do_not_act_entry_by_entry():
     exchanged = lambda p: {"a": p["b"], "b": p["a"]}
     found = [acts_elementwise(fn, p) for fn in (apart, mixed, exchanged)]
     assert found == [True, False, False]
+
+
+@pytest.mark.core
+def test_friction_of_squared_momenta_is_linear_in_every_version_of_jax():
+    # Up to JAX 0.6 the derivative of `p**2 / 2` has the derivative `p**0`.
+    slope = jax.jit(jax.grad(jax.grad(lambda p: p**2 / 2)))
+    assert Dependence(slope, 1.0).independent(lambda p: p)
