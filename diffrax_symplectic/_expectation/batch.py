@@ -1,5 +1,6 @@
 """The program that computes one batch on each device."""
 
+import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -70,16 +71,14 @@ def _moments_on_devices(
     """The moments on all devices, along a leading axis. The first device begins with the
     sample number whose low and high 32 bits are in `low_high`. Only the first `num_wanted`
     samples of all devices together count."""
+    moments_on_device = ft.partial(
+        _moments_on_device,
+        key_data=key_data,
+        key_impl=key_impl,
+        samples_per_device=samples_per_device,
+    )
     if mesh.size == 1:
-        moments = _moments_on_device(
-            sampler,
-            key_data,
-            key_impl,
-            low_high,
-            num_wanted,
-            samples_per_device,
-            device=0,
-        )
+        moments = moments_on_device(sampler, low_high, num_wanted, device=0)
         return jtu.tree_map(lambda x: x[None], moments)
     dynamic, static = eqx.partition(sampler, eqx.is_array)
 
@@ -88,15 +87,7 @@ def _moments_on_devices(
     def gathered_moments(dynamic, low_high, num_wanted):
         sampler = eqx.combine(dynamic, static)
         device = jax.lax.axis_index(_DEVICE_AXIS)
-        moments = _moments_on_device(
-            sampler,
-            key_data,
-            key_impl,
-            low_high,
-            num_wanted,
-            samples_per_device,
-            device,
-        )
+        moments = moments_on_device(sampler, low_high, num_wanted, device)
         return jtu.tree_map(lambda x: jax.lax.all_gather(x, _DEVICE_AXIS), moments)
 
     # Every device gets all arguments, and returns the moments of all.
@@ -125,12 +116,13 @@ quick_batch_moments = quickly_compiled(_moments_on_devices)
 
 def _moments_on_device(
     sampler: Callable[..., Samples],
-    key_data: UInt32[Array, "..."],
-    key_impl: Any,
     low_high: UInt32[Array, "2"],
     num_wanted: Int[Array, ""],
-    samples_per_device: int,
     device: Any,
+    *,
+    key_data: UInt32[Array, "..."],
+    key_impl: Any,
+    samples_per_device: int,
 ) -> BatchMoments:
     """The moments of the samples of the device with this number. The other arguments are
     those of `_moments_on_devices`."""

@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, PRNGKeyArray, PyTree
 from .._brownian import Discrete, laws_of, UnspecifiedPath
 from .._custom_types import Args, Devices, RealScalarLike, Y
 from .._simulation import (
+    advice_on_failures,
     has_discrete_increments,
     Problem,
     warn_of_stragglers,
@@ -204,18 +205,15 @@ def expectation(
                 break
             levels += 1
 
+    advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
     # `num_paths` are those that did not fail.
-    most_fail = estimate.num_failed > estimate.num_paths
-    cause = ""
-    if most_fail and may_be_too_long(problem):
-        cause = (
+    if estimate.num_failed > estimate.num_paths and may_be_too_long(problem):
+        advice = (
             f"Most likely, steps of `dt0={float(dt0):g}` are too long for "
             f"`{type(solver).__name__}`: pass `dt0={float(dt0) / 4:g}` or less, or an "
-            "implicit solver. "
+            f"implicit solver. {advice}"
         )
-    has_bounded_increments = problem.has_bounded_increments
-    is_implicit = problem.is_implicit
-    for message in cautions(estimate, tol, has_bounded_increments, is_implicit, cause):
+    for message in cautions(estimate, tol, advice):
         warnings.warn(message, stacklevel=2)
     paths = plan.simulate_paths
     if isinstance(paths, FusedPaths):

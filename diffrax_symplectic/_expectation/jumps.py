@@ -118,15 +118,20 @@ def _jumps(
 ) -> Bool[Array, " ends"]:
     """For the end of each step, whether forces jump there without a mean of both sides.
     `times` are those of `_Sides`."""
-    states = [y0, _moved(y0)]
+    y0_and_moved = jtu.tree_map(lambda *leaves: jnp.stack(leaves), y0, _moved(y0))
+
+    def force_at(t: Array, y: Y) -> Float[Array, " n"]:
+        force, _ = rate(forces, t, y, args)
+        return jfu.ravel_pytree(force)[0]
 
     def jumps_there(end: tuple[Array, Array]) -> Bool[Array, ""]:
         times, is_last = end
-        found = []
-        for y in states:
-            sides = jax.vmap(lambda t: jfu.ravel_pytree(rate(forces, t, y, args)[0])[0])
-            found.append(_is_jump(_Sides(*sides(times)), is_last))
-        return jnp.any(jnp.stack(found))
+
+        def jumps_at(y: Y) -> Bool[Array, ""]:
+            sides = jax.vmap(force_at, in_axes=(0, None))(times, y)
+            return _is_jump(_Sides(*sides), is_last)
+
+        return jnp.any(jax.vmap(jumps_at)(y0_and_moved))
 
     return lax.map(jumps_there, (times, is_last), batch_size=_ENDS_AT_ONCE)
 

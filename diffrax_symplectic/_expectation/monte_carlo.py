@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 from .._arguments import check_real, check_takes, whole_number
 from .._compat import is_result
 from .._root_finder import all_finite
-from .._simulation import combinations, level_weights
+from .._simulation import advice_on_failures, combinations, level_weights
 from .call import checked_call
 from .estimate import cautions, Expectation
 from .independent import IndependentPaths
@@ -118,7 +118,8 @@ def monte_carlo(
     )
     with Meter(progress_meter) as meter:
         estimate = run(plan, key, devices, sampling, start, first, tol, meter)
-    for message in cautions(estimate, tol, bounded=False):
+    advice = advice_on_failures(has_bounded_increments=False, is_implicit=False)
+    for message in cautions(estimate, tol, advice):
         warnings.warn(message, stacklevel=2)
     return estimate
 

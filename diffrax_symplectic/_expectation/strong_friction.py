@@ -102,17 +102,24 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
             "masses are constant."
         )
     if may_change and friction_of_step > _HARDLY_DAMPED:
-        change = float(_quick_change(problem, dt0))
-        if change > _MOST_CHANGE:
-            return (
-                f"Steps of `dt0={dt0:g}` do not resolve how the friction changes with "
-                f"positions: by {change:.0%} along one step from where paths start, at "
-                "the speed of the heat bath, while momenta decay at a rate of "
-                f"{friction_of_step:.3g} / `dt0`. Two levels may agree on a wrong mean, as "
-                "of a diffusion. Pass a smaller `dt0`, in which the friction changes, or "
-                "turns, by a small part."
-            )
+        return _unresolved_change(problem, dt0, friction_of_step)
     return None
+
+
+def _unresolved_change(
+    problem: Problem, dt0: float, friction_of_step: float
+) -> str | None:
+    """`unresolved_friction` for the change of strong friction with positions."""
+    change = float(_quick_change(problem, dt0))
+    if not change > _MOST_CHANGE:
+        return None
+    return (
+        f"Steps of `dt0={dt0:g}` do not resolve how the friction changes with positions: "
+        f"by {change:.0%} along one step from where paths start, at the speed of the heat "
+        f"bath, while momenta decay at a rate of {friction_of_step:.3g} / `dt0`. Two "
+        "levels may agree on a wrong mean, as of a diffusion. Pass a smaller `dt0`, in "
+        "which the friction changes, or turns, by a small part."
+    )
 
 
 def _depends_on_positions(problem: Problem, friction: Terms) -> bool:

@@ -34,8 +34,8 @@ class Dependence:
 
 
 def _without_powers_of_zero(jaxpr: Jaxpr) -> Jaxpr:
-    """The program, in which `x**0` does not read `x`, nor in the programs that it calls. Up
-    to JAX 0.6 the second derivative of `x**2` contains it."""
+    """The program, in which `x**0` does not read `x`, nor in the programs that it calls. In
+    JAX 0.6.1 the second derivative of `x**2` contains it."""
 
     def reads_less(eqn: Any) -> Any:
         if eqn.primitive.name == "integer_pow" and eqn.params["y"] == 0:

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 
-from ..._simulation import advice_on_failures, Combination
+from ..._simulation import Combination
 from ..sampling import ROUNDING
 from .estimate import combined_results, Expectation
 from .moments import total
@@ -32,18 +32,11 @@ _SURE_OF_CHANGE = 4
 _MANY_MORE = 10
 
 
-def cautions(
-    estimate: Expectation,
-    tol: float | None,
-    bounded: bool,
-    implicit: bool = False,
-    cause: str = "",
-) -> Iterator[str]:
-    """The warnings for an estimate. `bounded` is whether the increments of all paths are
-    known to be bounded, `implicit` whether the solver is known to be implicit, `cause` a
-    sentence on why paths failed, if that is known."""
+def cautions(estimate: Expectation, tol: float | None, advice: str) -> Iterator[str]:
+    """The warnings for an estimate. `advice` is what to do about failed paths, in
+    sentences."""
     if estimate.num_failed > 0:
-        yield from _cautions_on_failures(estimate, bounded, implicit, cause)
+        yield from _cautions_on_failures(estimate, advice)
     if estimate.num_samples > 1:
         yield from _cautions_on_mean(estimate)
         yield from _cautions_on_samples(estimate)
@@ -52,9 +45,7 @@ def cautions(
         yield f"`tol={tol}` was not reached: {shortfall(estimate, tol)}."
 
 
-def _cautions_on_failures(
-    estimate: Expectation, bounded: bool, implicit: bool, cause: str
-) -> Iterator[str]:
+def _cautions_on_failures(estimate: Expectation, advice: str) -> Iterator[str]:
     """Warns of failed paths that could change the mean by more than its standard error."""
     changes = jtu.tree_leaves(estimate.failed_error)
     errors = jtu.tree_leaves(estimate.std_error)
@@ -76,8 +67,7 @@ def _cautions_on_failures(
                 f"; the first two steps do not agree, since {num_with_dt0:,} paths fail "
                 f"with steps of `dt0` and {num_with_half:,} with half of it"
             )
-    advice = advice_on_failures(bounded, implicit)
-    yield f"{estimate.num_failed:,} paths failed: {consequence}. {cause}{advice}"
+    yield f"{estimate.num_failed:,} paths failed: {consequence}. {advice}"
 
 
 def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
