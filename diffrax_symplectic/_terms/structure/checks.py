@@ -204,21 +204,10 @@ def _separable_faults(
 def _faults_of_drift(momentum_half: int, drift: list[_Traced]) -> list[Fault]:
     """`_separable_faults` of the drift."""
     position_half = 1 - momentum_half
-
-    # Parts of the inputs of `_dependence`.
-    def momenta(t: Any, y: Y, control: Any) -> PyTree:
-        return y[momentum_half]
-
-    def positions(t: Any, y: Y, control: Any) -> PyTree:
-        return y[position_half]
-
-    # Parts of its result, the change of the state.
-    def change_of_momenta(change: Y) -> PyTree:
-        return change[momentum_half]
-
-    def change_of_positions(change: Y) -> PyTree:
-        return change[position_half]
-
+    momenta = ft.partial(_half_of_state, momentum_half)
+    positions = ft.partial(_half_of_state, position_half)
+    change_of_momenta = ft.partial(_half_of_change, momentum_half)
+    change_of_positions = ft.partial(_half_of_change, position_half)
     rules = (
         _Forbidden(
             part=change_of_momenta,
@@ -261,18 +250,9 @@ def _faults_of_noise(
 ) -> list[Fault]:
     """`_separable_faults` of the noise."""
     position_half = 1 - momentum_half
-
-    # A part of the inputs of `_dependence`.
-    def momenta(t: Any, y: Y, control: Any) -> PyTree:
-        return y[momentum_half]
-
-    # Parts of its result, the change of the state.
-    def change_of_momenta(change: Y) -> PyTree:
-        return change[momentum_half]
-
-    def change_of_positions(change: Y) -> PyTree:
-        return change[position_half]
-
+    momenta = ft.partial(_half_of_state, momentum_half)
+    change_of_momenta = ft.partial(_half_of_change, momentum_half)
+    change_of_positions = ft.partial(_half_of_change, position_half)
     faults = []
     for term, dependence in noise:
         is_plain = not is_hamiltonian(term)
@@ -403,6 +383,16 @@ def _states(t: Any, y: Y, control: Any) -> Y:
 
 def _increments(t: Any, y: Y, control: Any) -> Any:
     return control
+
+
+def _half_of_state(half: int, t: Any, y: Y, control: Any) -> PyTree:
+    """A part of the inputs of `_dependence`."""
+    return y[half]
+
+
+def _half_of_change(half: int, change: Y) -> PyTree:
+    """A part of the result of `_dependence`, the change of the state."""
+    return change[half]
 
 
 def _not_asserted(terms: Terms, structure: str) -> list[diffrax.AbstractTerm]:
