@@ -38,7 +38,7 @@ from .estimate import (
     needs_level,
 )
 from .fused_paths import FusedPaths
-from .jumps import jumping_forces
+from .jumps import jumps_at_step_ends, jumps_within_steps
 from .kinks import has_kinks
 from .long_steps import may_be_too_long, too_long_steps, unresolved_noise
 from .run import Meter, NO_METER, run
@@ -170,7 +170,8 @@ def expectation(
     not smooth and a trial with Gaussian increments has another mean than discrete ones. Of
     the steps: if two levels do not agree, if steps are too long at `y0` for an explicit
     solver, for [`diffrax_symplectic.StrangGauss`][], for the noise or for the friction, if
-    the forces of `BAOAB` jump at the end of a step, and if rounding in single precision may
+    forces or noise jump in time within a step, or at its end where the solver takes them,
+    and if rounding in single precision may
     exceed the standard error.
 
     **Source:** [Chan, Golub and LeVeque
@@ -223,16 +224,19 @@ def expectation(
     _warn_of_rounding(estimate, problem)
     # Warnings of the problem come with its first samples, and not again with later parts.
     if start is None and first == 0:
-        # With three levels the order is checked, which shows such steps. With one level the
-        # result does not claim to include the discretization error.
+        # With one level the result does not claim to include the discretization error.
+        told = []
+        if estimate.levels > 1:
+            told.append(jumps_within_steps(problem))
+        # With three levels the order is checked, which shows such steps.
         if estimate.levels == 2:
-            of_steps = too_long_steps(problem, float(dt0))
-            of_noise = unresolved_noise(problem, float(dt0))
-            of_friction = unresolved_friction(problem, float(dt0))
-            of_jumps = jumping_forces(problem)
-            for message in (of_steps, of_noise, of_friction, of_jumps):
-                if message is not None:
-                    warnings.warn(message, stacklevel=2)
+            told.append(too_long_steps(problem, float(dt0)))
+            told.append(unresolved_noise(problem, float(dt0)))
+            told.append(unresolved_friction(problem, float(dt0)))
+            told.append(jumps_at_step_ends(problem))
+        for message in told:
+            if message is not None:
+                warnings.warn(message, stacklevel=2)
         warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
         if has_kinks(problem):
             _warn_of_law(estimate, problem, key, devices)

@@ -1,24 +1,34 @@
-"""Whether forces jump at step ends, for solvers that take them there."""
+"""Whether forces or noise jump in time, where two levels do not show what that does."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
+import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PyTree
 
+from .._brownian import zeros_and_unravel
 from .._compat import quickly_compiled
 from .._custom_types import Args, Terms, Y
 from .._simulation import Problem
-from .._solver import AbstractLangevinSplitting, kicks_and_rest
+from .._solver import (
+    AbstractLangevinSplitting,
+    AbstractSymplecticRungeKutta,
+    kicks_and_rest,
+)
 from .._terms import (
+    apply,
+    control_struct,
     Dependence,
     momentum_first,
     rate,
     split_friction,
+    split_terms,
     without_constraint,
 )
 
@@ -30,61 +40,112 @@ _ROUNDINGS = 16
 _SMOOTH_PART = 1e-3
 # A jump is larger than so many times this change.
 _JUMP = 4
-# The most ends of steps that are looked at, the first ones, and how many at once.
-_MOST_ENDS = 2**14
-_ENDS_AT_ONCE = 256
+# The most steps that are looked at, the first ones, and how many at once.
+_MOST_STEPS = 2**14
+_STEPS_AT_ONCE = 256
+# In this many steps, those with the largest changes, a jump is searched for, by bisection
+# of the part that changes most. Over a whole step the field may change more than it jumps.
+_MOST_SEARCHED = 256
+_PARTS = 32
+
+# A vector field at a time and a state, as one vector. (A `jax.tree_util.Partial`, so that
+# the terms in it are arguments of programs.)
+_Field = Callable[[Array, Y], Float[Array, " n"]]
 
 
 class _Sides(NamedTuple):
-    """The forces around the end of a step, each as one vector.
+    """A vector field around a time, such as the end of a step.
 
-    - `far_before`, `far_after`: on both sides, as far away as smooth forces change little.
+    - `far_before`, `far_after`: on both sides, as far away as smooth fields change little.
     - `before`, `after`: on both sides, as near as the rounding of times allows.
-    - `there`: at the end of the step itself.
     """
 
     far_before: Float[Array, " n"]
     before: Float[Array, " n"]
-    there: Float[Array, " n"]
     after: Float[Array, " n"]
     far_after: Float[Array, " n"]
 
+    @property
+    def smooth_change(self) -> Float[Array, ""]:
+        """How much the field changes on either side, and by rounding."""
+        before = jnp.linalg.norm(self.before - self.far_before)
+        after = jnp.linalg.norm(self.far_after - self.after)
+        size = jnp.linalg.norm(jnp.stack(self))
+        return _JUMP * (before + after) + jnp.sqrt(jnp.finfo(size.dtype).eps) * size
 
-def jumping_forces(problem: Problem) -> str | None:
-    """What is wrong with forces that jump at the end of a step, as a sentence; `None` if
-    none do, or for other solvers than `BAOAB` and its like: these take no forces there, or
-    are of order 1 anyway, by which two levels extrapolate.
 
-    The half kicks before and after the jump both see the same side of it, so the step is of
-    order 1. Two levels extrapolate by order 2, and differ by less than the error. Looks at
-    the ends of the shortest steps, so also at the middles of the longest ones."""
-    solver = problem.solver
-    # The stages of all tableaus are within the step.
-    if not isinstance(solver, AbstractLangevinSplitting) or not solver.symmetric:
+class _Steps(NamedTuple):
+    """The shortest steps of a problem, as many as are looked at.
+
+    - `starts`, `h`: when they start, and how long they are.
+    - `near`, `far`: the distances of `_Sides`.
+    """
+
+    starts: Float[np.ndarray, " steps"]
+    h: float
+    near: float
+    far: float
+
+
+def jumps_within_steps(problem: Problem) -> str | None:
+    """What is wrong with forces or noise that jump in time between the ends of the shortest
+    steps, as a sentence; `None` if none do.
+
+    Any solver then makes an error of first order. As long as all levels take the jump at
+    the same end of a step, this error is the same on all of them. Jumps at a random time of
+    each path are not meant: the mean over this time makes the error small."""
+    y0 = problem.y0
+    drift, noise = split_terms(without_constraint(problem.terms))
+
+    def field_of(args: Args) -> _Field:
+        return jtu.Partial(_all_fields, drift, noise, args)
+
+    if not _depends_on_time(field_of(problem.args), problem, y0):
         return None
+    steps = _steps_of(problem)
+    if steps is None:
+        return None
+    times = _times_of_jumps(field_of(problem.args), problem, steps)
+    if problem.args_of is not None and times.size:
+        other_args = problem.with_args(problem.draw_start(jr.key(2)).args).args
+        others = _times_of_jumps(field_of(other_args), problem, steps)
+        is_same = np.abs(times[:, None] - others) < steps.far
+        times = times[np.any(is_same, axis=1)]
+    if not times.size:
+        return None
+    return (
+        f"The forces or the noise jump within a step, such as at t={np.min(times):.6g}. "
+        "Then all solvers converge to first order only, and two levels may agree on a "
+        "wrong mean. Choose `dt0` so that steps end at each jump."
+    )
+
+
+def jumps_at_step_ends(problem: Problem) -> str | None:
+    """What is wrong with forces or noise that jump at the end of a step, as a sentence;
+    `None` if none do, or for solvers that do not take them there, or are of order 1 anyway,
+    by which two levels extrapolate.
+
+    The steps before and after the jump both take the same side of it, so they are of order
+    1. Two levels extrapolate by order 2, and differ by less than the error. Looks at the
+    ends of the shortest steps, so also at the middles of the longest ones."""
+    solver = problem.solver
+    if isinstance(solver, AbstractLangevinSplitting) and solver.symmetric:
+        return _jumping_kicks(problem, solver)
+    if isinstance(solver, AbstractSymplecticRungeKutta):
+        return _jumping_stages(problem, solver)
+    return None
+
+
+def _jumping_kicks(problem: Problem, solver: AbstractLangevinSplitting) -> str | None:
+    """`jumps_at_step_ends` for the forces of splittings that begin and end with a kick."""
     terms, y0 = momentum_first(problem.terms, problem.y0)
     drift, _, _ = split_friction(without_constraint(terms))
     kicks, _ = kicks_and_rest(solver.flow, drift)
-    if not kicks or not _depend_on_time(kicks, problem, y0):
+    if not kicks:
         return None
-    h = float(problem.levels.h[-1])
-    t0 = float(problem.t0)
-    # A jump at `t0` is none: paths see one side of it alone.
-    numbers = np.arange(1, min(problem.finest_steps, _MOST_ENDS) + 1)
-    ends = t0 + h * numbers
-    is_last = numbers == problem.finest_steps
-    rounding = float(np.finfo(problem.dtype).eps) * max(abs(t0), abs(ends[-1]))
-    near = _ROUNDINGS * rounding
-    far = max(_SMOOTH_PART * h, 4 * near)
-    # In single precision, long after time zero, the other times may be whole steps away.
-    if far > h / 8:
+    end = _first_jump_at_end(jtu.Partial(_forces, kicks, problem.args), problem, y0)
+    if end is None:
         return None
-    times = np.stack([ends - far, ends - near, ends, ends + near, ends + far], axis=1)
-    times = times.astype(problem.dtype)
-    do_jump = _quick_jumps(kicks, problem.args, y0, times, is_last)
-    if not np.any(do_jump):
-        return None
-    first = float(ends[np.argmax(do_jump)])
     name = type(solver).__name__
     other_cure = ""
     if solver.flow is None:
@@ -92,67 +153,203 @@ def jumping_forces(problem: Problem) -> str | None:
             f", or pass `{name}(ImplicitMidpoint())`, which takes forces within steps"
         )
     return (
-        f"The forces jump at step ends, such as t={first:.6g}, and `{name}` takes one side "
+        f"The forces jump at step ends, such as t={end:.6g}, and `{name}` takes one side "
         "of the jump for both steps: the mean converges to first order only, and two "
         "levels do not see it. Let the function of time return the mean of both sides at "
         f"a jump{other_cure}."
     )
 
 
-def _depend_on_time(forces: Terms, problem: Problem, y0: Y) -> bool:
-    """Whether forces read the time, by their dependence, not by their values."""
+def _jumping_stages(
+    problem: Problem, solver: AbstractSymplecticRungeKutta
+) -> str | None:
+    """`jumps_at_step_ends` for tableaus."""
+    if solver.weak_order(problem.terms) in (1, None):
+        return None
+    drift, noise = split_terms(without_constraint(problem.terms))
+    at_ends = [s for s in solver.tableau.flatten().stages if s.c in (0, 1)]
+    end = None
+    what = "forces jump"
+    # Velocities do not depend on time, so the stages of positions may be anywhere.
+    if drift and any(s.channels == ("h",) and s.writes != "q" for s in at_ends):
+        field = jtu.Partial(_drift_field, drift, problem.args)
+        end = _first_jump_at_end(field, problem, problem.y0)
+    if end is None and noise and any(s.channels != ("h",) for s in at_ends):
+        what = "noise jumps"
+        field = jtu.Partial(_noise_field, noise, problem.args)
+        end = _first_jump_at_end(field, problem, problem.y0)
+    if end is None:
+        return None
+    return (
+        f"The {what} at step ends, such as t={end:.6g}, and `{type(solver).__name__}` "
+        "takes one side of the jump for both steps: the mean converges to first order "
+        "only, and two levels do not see it. Pass a solver that takes forces and noise "
+        "within steps, such as `ImplicitMidpoint()`."
+    )
 
-    def forces_at(t: Array) -> Y:
-        return rate(forces, t, y0, problem.args)[0]
 
-    dependence = Dependence(forces_at, jnp.asarray(problem.t0))
+def _forces(terms: Terms, args: Args, t: Array, y: Y) -> Float[Array, " n"]:
+    """The rates of the momenta."""
+    force, _ = rate(terms, t, y, args)
+    return jfu.ravel_pytree(force)[0]
+
+
+def _drift_field(terms: Terms, args: Args, t: Array, y: Y) -> Float[Array, " n"]:
+    """The rate of the state."""
+    return jfu.ravel_pytree(rate(terms, t, y, args))[0]
+
+
+def _noise_field(terms: Terms, args: Args, t: Array, y: Y) -> Float[Array, " n"]:
+    """The change of the state by noise, for arbitrary increments of size one."""
+    zeros, unravel = zeros_and_unravel([control_struct(term, t) for term in terms])
+    controls = unravel(jnp.cos(1.0 + jnp.arange(zeros.size, dtype=zeros.dtype)))
+    return jfu.ravel_pytree(apply(terms, controls, args, t, y))[0]
+
+
+def _all_fields(
+    drift: Terms, noise: Terms, args: Args, t: Array, y: Y
+) -> Float[Array, " n"]:
+    """The rate of the drift with its friction, and the change by noise."""
+    fields = []
+    if drift:
+        fields.append(_drift_field(drift, args, t, y))
+    if noise:
+        fields.append(_noise_field(noise, args, t, y))
+    return jnp.concatenate(fields)
+
+
+def _depends_on_time(field: _Field, problem: Problem, y0: Y) -> bool:
+    """Whether a field reads the time, by its dependence, not by its values."""
+    dependence = Dependence(lambda t: field(t, y0), jnp.asarray(problem.t0))
     return not dependence.independent(lambda t: t)
 
 
-def _jumps(
-    forces: Terms,
-    args: Args,
-    y0: Y,
-    times: Float[Array, "ends 5"],
-    is_last: Bool[Array, " ends"],
-) -> Bool[Array, " ends"]:
-    """For the end of each step, whether forces jump there without a mean of both sides.
-    `times` are those of `_Sides`."""
-    y0_and_moved = jtu.tree_map(lambda *leaves: jnp.stack(leaves), y0, _moved(y0))
+def _steps_of(problem: Problem) -> _Steps | None:
+    """The steps to look at; `None` in single precision long after time zero, if the times
+    around the end of a step may be whole steps away."""
+    h = float(problem.levels.h[-1])
+    numbers = np.arange(min(problem.finest_steps, _MOST_STEPS))
+    starts = float(problem.t0) + h * numbers
+    largest = max(abs(float(problem.t0)), abs(starts[-1] + h))
+    near = _ROUNDINGS * float(np.finfo(problem.dtype).eps) * largest
+    far = max(_SMOOTH_PART * h, 4 * near)
+    if far > h / 8:
+        return None
+    return _Steps(starts, h, near, far)
 
-    def force_at(t: Array, y: Y) -> Float[Array, " n"]:
-        force, _ = rate(forces, t, y, args)
-        return jfu.ravel_pytree(force)[0]
+
+def _times_of_jumps(
+    field: _Field, problem: Problem, steps: _Steps
+) -> Float[np.ndarray, " jumps"]:
+    """When a field jumps within steps, not at their ends."""
+    # Jumps this near to the end of a step do as little harm as those at it.
+    ends = np.stack(
+        [steps.starts + steps.far, steps.starts + steps.h - steps.far], axis=1
+    )
+    ends = ends.astype(problem.dtype)
+    halvings = max(0, int(np.ceil(np.log2(steps.h / _PARTS / steps.near))))
+    distances = np.array([steps.near, steps.far], problem.dtype)
+    times, is_jump = _quick_search(field, problem.y0, ends, halvings, distances)
+    return np.asarray(times)[np.asarray(is_jump)]
+
+
+def _search(
+    field: _Field,
+    y0: Y,
+    ends: Float[Array, "steps 2"],
+    halvings: int,
+    near_and_far: Float[Array, "2"],
+) -> tuple[Float[Array, " searched"], Bool[Array, " searched"]]:
+    """For the steps between these `ends` in which a field changes most: when it does, and
+    whether this is a jump."""
+    at_both = _at_both(field, y0)
+    near, far = near_and_far
+
+    def largest_change(start_and_end: Array) -> Array:
+        start, end = start_and_end
+        values = jax.vmap(at_both)(jnp.stack([start, (start + end) / 2, end]))
+        return jnp.max(jnp.linalg.norm(jnp.diff(values, axis=0), axis=1))
+
+    def jump_in(start_and_end: Array) -> tuple[Array, Bool[Array, ""]]:
+        def halve(_, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+            times, values = bracket
+            middle = jnp.mean(times)
+            value = at_both(middle)
+            changes = jnp.linalg.norm(values - value, axis=1)
+            is_first = changes[0] >= changes[1]
+            first = jnp.array([times[0], middle]), jnp.stack([values[0], value])
+            second = jnp.array([middle, times[1]]), jnp.stack([value, values[1]])
+            return jtu.tree_map(lambda x, y: jnp.where(is_first, x, y), first, second)
+
+        times = jnp.linspace(start_and_end[0], start_and_end[1], _PARTS + 1)
+        values = jax.vmap(at_both)(times)
+        part = jnp.argmax(jnp.linalg.norm(jnp.diff(values, axis=0), axis=1))
+        both_ends = part + jnp.arange(2)
+        bracket = times[both_ends], values[both_ends]
+        times, _ = lax.fori_loop(0, halvings, halve, bracket)
+        time = jnp.mean(times)
+        around = jnp.array([-far, -near, near, far])
+        sides = _Sides(*jax.vmap(at_both)(time + around))
+        jump = jnp.linalg.norm(sides.after - sides.before)
+        return time, jump > sides.smooth_change
+
+    changes = lax.map(largest_change, ends, batch_size=_STEPS_AT_ONCE)
+    _, largest = lax.top_k(changes, min(_MOST_SEARCHED, len(ends)))
+    return jax.vmap(jump_in)(ends[largest])
+
+
+def _first_jump_at_end(field: _Field, problem: Problem, y0: Y) -> float | None:
+    """The first end of a step at which a field jumps; `None` if there is none."""
+    if not _depends_on_time(field, problem, y0):
+        return None
+    steps = _steps_of(problem)
+    if steps is None:
+        return None
+    # A jump at `t0` is none: paths see one side of it alone.
+    ends = steps.starts + steps.h
+    is_last = np.arange(1, len(ends) + 1) == problem.finest_steps
+    around = np.array([-steps.far, -steps.near, steps.near, steps.far, 0])
+    times = (ends[:, None] + around).astype(problem.dtype)
+    do_jump = _quick_jumps(field, y0, times, is_last)
+    if not np.any(do_jump):
+        return None
+    return float(ends[np.argmax(do_jump)])
+
+
+def _jumps(
+    field: _Field, y0: Y, times: Float[Array, "ends 5"], is_last: Bool[Array, " ends"]
+) -> Bool[Array, " ends"]:
+    """For the end of each step, whether a field jumps there without a mean of both sides.
+    `times` are those of `_Sides` and the end itself."""
+    at_both = _at_both(field, y0)
 
     def jumps_there(end: tuple[Array, Array]) -> Bool[Array, ""]:
         times, is_last = end
+        *sides, there = jax.vmap(at_both)(times)
+        sides = _Sides(*sides)
+        error = jnp.linalg.norm(there - (sides.before + sides.after) / 2)
+        # No step follows the last end, so that the side before it is right, too.
+        error_at_last = jnp.linalg.norm(there - sides.before)
+        error = jnp.where(is_last, jnp.minimum(error, error_at_last), error)
+        # Values that are not finite are no jumps.
+        return 2 * error > sides.smooth_change
 
-        def jumps_at(y: Y) -> Bool[Array, ""]:
-            sides = jax.vmap(force_at, in_axes=(0, None))(times, y)
-            return _is_jump(_Sides(*sides), is_last)
-
-        return jnp.any(jax.vmap(jumps_at)(y0_and_moved))
-
-    return lax.map(jumps_there, (times, is_last), batch_size=_ENDS_AT_ONCE)
+    return lax.map(jumps_there, (times, is_last), batch_size=_STEPS_AT_ONCE)
 
 
-def _is_jump(sides: _Sides, is_last: Bool[Array, ""]) -> Bool[Array, ""]:
-    """Whether the force at the end of a step is not that of a step which ends there."""
-    error = jnp.linalg.norm(sides.there - (sides.before + sides.after) / 2)
-    # No step follows the last end, so that the side before it is right, too.
-    error_at_last = jnp.linalg.norm(sides.there - sides.before)
-    error = jnp.where(is_last, jnp.minimum(error, error_at_last), error)
-    smooth_change = jnp.linalg.norm(sides.before - sides.far_before)
-    smooth_change += jnp.linalg.norm(sides.far_after - sides.after)
-    size = jnp.linalg.norm(jnp.stack(sides))
-    rounding = jnp.sqrt(jnp.finfo(size.dtype).eps) * size
-    # Values that are not finite are no jumps.
-    return 2 * error > _JUMP * smooth_change + rounding
+def _at_both(field: _Field, y0: Y) -> Callable[[Array], Float[Array, " n"]]:
+    """The field at a time, at `y0` and at an arbitrary state, as one vector: at `y0` a
+    force that jumps may vanish, as in a trap that is stiffened while a particle rests."""
+    y0_and_moved = jtu.tree_map(lambda *leaves: jnp.stack(leaves), y0, _moved(y0))
+
+    def at_both(t: Array) -> Float[Array, " n"]:
+        return jax.vmap(field, in_axes=(None, 0))(t, y0_and_moved).reshape(-1)
+
+    return at_both
 
 
 def _moved(y0: Y) -> Y:
-    """An arbitrary state: at `y0` a force that jumps may vanish, as in a trap that is
-    stiffened while a particle rests in it."""
+    """An arbitrary state, about as large as `y0`."""
 
     def moved_leaf(x: PyTree[Array]) -> Array:
         x = jnp.asarray(x)
@@ -164,4 +361,5 @@ def _moved(y0: Y) -> Y:
     return jtu.tree_map(moved_leaf, y0)
 
 
+_quick_search = quickly_compiled(_search)
 _quick_jumps = quickly_compiled(_jumps)

@@ -1,4 +1,4 @@
-"""Forces that jump at step ends are told where they make `BAOAB` first order."""
+"""Forces and noise that jump in time are told where two levels do not show their error."""
 
 import warnings
 
@@ -28,14 +28,15 @@ def _trap(stiffness):
     return lambda t, p, q, args: jnp.sum(p**2) / 2 + stiffness(t) * jnp.sum(q**2) / 2
 
 
-def _told(H0, solver, h, t1=2, y0=DISPLACED, args=None, **options):
+def _told(H0, solver, h, t1=2, y0=DISPLACED, args=None, T=1.0, terms=None, **options):
     """The estimate, and the warning of jumps, if there is one."""
-    terms = ds.langevin_terms(H0, 0.5, 1.0, ())
+    if terms is None:
+        terms = ds.langevin_terms(H0, 0.5, T, ())
     options = dict(key=jr.key(0), sampling=FEW) | options
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         got = ds.expectation(_square, terms, solver, 0, t1, h, y0, args, **options)
-    found = [str(x.message) for x in told if "jump at step ends" in str(x.message)]
+    found = [str(x.message) for x in told if "jump" in str(x.message)]
     assert len(found) <= 1
     return got, found[0] if found else None
 
@@ -137,7 +138,7 @@ SMOOTH = {
     "from the start": lambda t: jnp.where(t <= 0, 0.0, 1.0),
     "until the end": lambda t: jnp.where(t <= 2, 1.0, 4.0),
     "a sign, which is zero between": lambda t: 2 + jnp.sign(t - 1),
-    "within steps": lambda t: jnp.where(t < 1.03, 1.0, 4.0),
+    "the mean of both sides near a step end": _quench_by_mean,
 }
 
 
@@ -157,7 +158,7 @@ def test_single_precision_tells_of_jumps_and_not_of_smooth_forces(t0):
             warnings.simplefilter("always")
             given = _square, terms, ds.BAOAB(), t0, t0 + 2, 0.25, y0
             ds.expectation(*given, key=jr.key(0), sampling=FEW)
-        return any("jump at step ends" in str(x.message) for x in told)
+        return any("jump" in str(x.message) for x in told)
 
     assert is_told(lambda t: jnp.where(t < t0 + 1, 1.0, 4.0))
     assert not is_told(lambda t: 1 + jnp.sin(3 * t) / 2)
@@ -168,7 +169,81 @@ def test_three_levels_check_the_order_themselves():
     assert not _is_told(_trap(_quench), ds.BAOAB(), 0.25, levels=3)
 
 
-def test_flips_at_random_times_are_within_steps():
+WITHIN = 1.03
+# Of the mean square at time 2, by the equations of the moments before and after `WITHIN`:
+# if the stiffness jumps from 1 to 4, and if the temperature jumps from 1 to 10.
+EXACT_WITHIN = {"stiffness": 0.649278, "temperature": 2.286610}
+
+
+def _within_steps(what):
+    """The Hamiltonian and the temperature."""
+    if what == "stiffness":
+        return _trap(lambda t: jnp.where(t < WITHIN, 1.0, 4.0)), 1.0
+    return _trap(lambda t: 1.0), lambda t, q, args: jnp.where(t < WITHIN, 1.0, 10.0)
+
+
+@pytest.mark.parametrize("what", EXACT_WITHIN)
+@pytest.mark.parametrize(
+    "solver", [ds.ImplicitMidpoint(), ds.BAOAB(ds.ImplicitMidpoint())], ids=repr
+)
+def test_a_jump_within_a_step_is_told_and_beyond_the_error_bar(what, solver):
+    H0, T = _within_steps(what)
+    got, message = _told(H0, solver, 0.25, T=T, sampling=EXACTLY)
+    assert abs(got.mean - EXACT_WITHIN[what]) > 3 * got.error
+    assert "jump within a step, such as at t=1.03." in message
+
+
+@pytest.mark.parametrize("what", EXACT_WITHIN)
+def test_steps_that_end_at_the_jump_give_the_right_mean_and_are_not_told(what):
+    H0, T = _within_steps(what)
+    # As many steps before the jump as fit, up to a start that is a little earlier.
+    h = WITHIN / 5
+    solver = ds.BAOAB(ds.ImplicitMidpoint())
+    got, message = _told(H0, solver, h, t1=10 * h, T=T, sampling=EXACTLY)
+    finer, _ = _told(H0, solver, h / 8, t1=10 * h, T=T, sampling=EXACTLY)
+    assert abs(got.mean - finer.mean) < got.error
+    assert message is None
+
+
+def test_three_levels_tell_of_jumps_within_steps_too():
+    H0, T = _within_steps("temperature")
+    got, message = _told(H0, ds.BAOAB(), 0.25, T=T, levels=3, sampling=EXACTLY)
+    assert abs(got.mean - EXACT_WITHIN["temperature"]) > 3 * got.error
+    assert "jump within a step" in message
+
+
+def test_one_level_does_not_tell_since_its_bar_leaves_out_the_error_of_the_step():
+    assert not _is_told(_within_steps("stiffness")[0], ds.BAOAB(), 0.125, levels=1)
+
+
+@pytest.mark.parametrize(
+    "solver", [ds.StormerVerlet(), diffrax.Heun()], ids=["StormerVerlet", "Heun"]
+)
+@pytest.mark.parametrize("what", ["forces", "noise"])
+def test_jumps_within_steps_are_told_for_any_solver(what, solver):
+    jumping = lambda t: jnp.where(t < WITHIN, 1.0, 4.0)
+    H0 = _trap(jumping if what == "forces" else lambda t: 1.0)
+    noise = lambda t, p, q, args: q * (jumping(t) if what == "noise" else 1.0)
+    terms = ds.hamiltonian_terms(H0, noise, ())
+    assert "jump within a step" in _told(None, solver, 0.25, terms=terms)[1]
+
+
+def test_a_small_jump_beside_a_large_smooth_drive_is_found():
+    drive = lambda t: 30 * jnp.sin(2 * t) + jnp.where(t < WITHIN, 0.0, 3.0)
+    driven = lambda t, p, q, args: (p**2 + q**2) / 2 - drive(t) * q
+    message = _told(driven, ds.BAOAB(), 0.25)[1]
+    assert "such as at t=1.03." in message
+
+
+def test_a_jump_at_the_same_time_of_all_paths_is_told_where_args_are_drawn():
+    size = lambda key: jr.uniform(key, (), minval=1.0, maxval=4.0)
+    energy = lambda t, p, q, size: (
+        p**2 / 2 + jnp.where(t < WITHIN, 1.0, size) * q**2 / 2
+    )
+    assert _is_told(energy, ds.BAOAB(), 0.25, args=size)
+
+
+def test_jumps_at_random_times_are_not_told():
     def flips(key):
         return jr.uniform(key, (), minval=0.0, maxval=2.0)
 
@@ -177,6 +252,37 @@ def test_flips_at_random_times_are_within_steps():
 
     sampling = ds.IndependentPaths(64)
     assert not _is_told(energy, ds.BAOAB(), 0.25, args=flips, sampling=sampling)
+
+
+# The mean square at time 2 of an oscillator, first at (0, 2), whose noise jumps from 1 to 3
+# at time 1.
+EXACT_WITH_NOISE = 4.063318
+
+
+def _with_jumping_noise(solver, **options):
+    noise = lambda t, p, q, args: jnp.where(t < 1, 1.0, 3.0) * q
+    terms = ds.hamiltonian_terms(_trap(lambda t: 1.0), noise, ())
+    return _told(None, solver, 0.25, terms=terms, **options)
+
+
+def test_noise_that_jumps_at_a_step_end_is_told_and_beyond_the_error_bar():
+    got, message = _with_jumping_noise(ds.SRKw4(), sampling=EXACTLY)
+    assert abs(got.mean - EXACT_WITH_NOISE) > 2 * got.error
+    assert "The noise jumps at step ends, such as t=1, and `SRKw4`" in message
+
+
+@pytest.mark.parametrize("solver", [ds.SRKs4(), ds.PlateauVerlet()], ids=repr)
+def test_noise_that_jumps_at_a_step_end_is_told_for_solvers_that_take_it_there(solver):
+    assert f"and `{type(solver).__name__}`" in _with_jumping_noise(solver)[1]
+
+
+@pytest.mark.parametrize(
+    "solver", [ds.ImplicitMidpoint(), ds.StrangGauss(), ds.StormerVerlet()], ids=repr
+)
+def test_solvers_that_take_noise_within_steps_are_right_where_it_jumps(solver):
+    got, message = _with_jumping_noise(solver, sampling=EXACTLY)
+    assert abs(got.mean - EXACT_WITH_NOISE) < got.error
+    assert message is None
 
 
 def _hanging(t, p, q, args):
