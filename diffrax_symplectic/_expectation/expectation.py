@@ -37,6 +37,8 @@ from .estimate import (
     largest_error,
     needs_level,
 )
+from .fast_drive import unresolved_drive
+from .finer_level import changes_with_finer_level
 from .fused_paths import FusedPaths
 from .jumps import jumps_at_step_ends, jumps_within_steps
 from .kinks import has_kinks
@@ -224,23 +226,41 @@ def expectation(
     _warn_of_rounding(estimate, problem)
     # Warnings of the problem come with its first samples, and not again with later parts.
     if start is None and first == 0:
-        # With one level the result does not claim to include the discretization error.
-        told = []
-        if estimate.levels > 1:
-            told.append(jumps_within_steps(problem))
-        # With three levels the order is checked, which shows such steps.
-        if estimate.levels == 2:
-            told.append(too_long_steps(problem, float(dt0)))
-            told.append(unresolved_noise(problem, float(dt0)))
-            told.append(unresolved_friction(problem, float(dt0)))
-            told.append(jumps_at_step_ends(problem))
-        for message in told:
-            if message is not None:
-                warnings.warn(message, stacklevel=2)
+        for message in _messages_on_steps(estimate, problem, float(dt0), key, devices):
+            warnings.warn(message, stacklevel=2)
         warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
         if has_kinks(problem):
             _warn_of_law(estimate, problem, key, devices)
     return estimate
+
+
+def _messages_on_steps(
+    estimate: Expectation,
+    problem: Problem,
+    dt0: float,
+    key: PRNGKeyArray,
+    devices: Devices,
+) -> list[str]:
+    """What is wrong with the steps, which the error of the estimate may not show."""
+    # With one level the result does not claim to include the discretization error.
+    if estimate.levels == 1:
+        return []
+    told = [jumps_within_steps(problem) or unresolved_drive(problem)]
+    # With three levels the order is checked, which shows the following.
+    if estimate.levels == 2:
+        told += [
+            too_long_steps(problem, dt0),
+            unresolved_noise(problem, dt0),
+            unresolved_friction(problem, dt0),
+            jumps_at_step_ends(problem),
+        ]
+    messages = [message for message in told if message is not None]
+    # A trial takes longer than the looks above, which name the cause.
+    if estimate.levels == 2 and not messages:
+        change = changes_with_finer_level(estimate, problem, key, devices)
+        if change is not None:
+            messages.append(change)
+    return messages
 
 
 def _warn_of_law(

@@ -1,20 +1,17 @@
 """Whether forces or noise jump in time, where two levels do not show what that does."""
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float
 
-from .._brownian import zeros_and_unravel
 from .._compat import quickly_compiled
-from .._custom_types import Args, Terms, Y
+from .._custom_types import Y
 from .._simulation import Problem
 from .._solver import (
     AbstractLangevinSplitting,
@@ -22,14 +19,19 @@ from .._solver import (
     kicks_and_rest,
 )
 from .._terms import (
-    apply,
-    control_struct,
-    Dependence,
     momentum_first,
-    rate,
     split_friction,
     split_terms,
     without_constraint,
+)
+from .fields_in_time import (
+    all_fields,
+    at_both_states,
+    depends_on_time,
+    drift_field,
+    Field,
+    force_field,
+    noise_field,
 )
 
 
@@ -47,10 +49,6 @@ _STEPS_AT_ONCE = 256
 # of the part that changes most. Over a whole step the field may change more than it jumps.
 _MOST_SEARCHED = 256
 _PARTS = 32
-
-# A vector field at a time and a state, as one vector. (A `jax.tree_util.Partial`, so that
-# the terms in it are arguments of programs.)
-_Field = Callable[[Array, Y], Float[Array, " n"]]
 
 
 class _Sides(NamedTuple):
@@ -94,21 +92,17 @@ def jumps_within_steps(problem: Problem) -> str | None:
     Any solver then makes an error of first order. As long as all levels take the jump at
     the same end of a step, this error is the same on all of them. Jumps at a random time of
     each path are not meant: the mean over this time makes the error small."""
-    y0 = problem.y0
-    drift, noise = split_terms(without_constraint(problem.terms))
-
-    def field_of(args: Args) -> _Field:
-        return jtu.Partial(_all_fields, drift, noise, args)
-
-    if not _depends_on_time(field_of(problem.args), problem, y0):
+    field = all_fields(problem, problem.args)
+    if not depends_on_time(field, problem, problem.y0):
         return None
     steps = _steps_of(problem)
     if steps is None:
         return None
-    times = _times_of_jumps(field_of(problem.args), problem, steps)
+    times = _times_of_jumps(field, problem, steps)
     if problem.args_of is not None and times.size:
         other_args = problem.with_args(problem.draw_start(jr.key(2)).args).args
-        others = _times_of_jumps(field_of(other_args), problem, steps)
+        other_field = all_fields(problem, other_args)
+        others = _times_of_jumps(other_field, problem, steps)
         is_same = np.abs(times[:, None] - others) < steps.far
         times = times[np.any(is_same, axis=1)]
     if not times.size:
@@ -143,7 +137,7 @@ def _jumping_kicks(problem: Problem, solver: AbstractLangevinSplitting) -> str |
     kicks, _ = kicks_and_rest(solver.flow, drift)
     if not kicks:
         return None
-    end = _first_jump_at_end(jtu.Partial(_forces, kicks, problem.args), problem, y0)
+    end = _first_jump_at_end(force_field(kicks, problem.args), problem, y0)
     if end is None:
         return None
     name = type(solver).__name__
@@ -172,11 +166,11 @@ def _jumping_stages(
     what = "forces jump"
     # Velocities do not depend on time, so the stages of positions may be anywhere.
     if drift and any(s.channels == ("h",) and s.writes != "q" for s in at_ends):
-        field = jtu.Partial(_drift_field, drift, problem.args)
+        field = drift_field(drift, problem.args)
         end = _first_jump_at_end(field, problem, problem.y0)
     if end is None and noise and any(s.channels != ("h",) for s in at_ends):
         what = "noise jumps"
-        field = jtu.Partial(_noise_field, noise, problem.args)
+        field = noise_field(noise, problem.args)
         end = _first_jump_at_end(field, problem, problem.y0)
     if end is None:
         return None
@@ -186,42 +180,6 @@ def _jumping_stages(
         "only, and two levels do not see it. Pass a solver that takes forces and noise "
         "within steps, such as `ImplicitMidpoint()`."
     )
-
-
-def _forces(terms: Terms, args: Args, t: Array, y: Y) -> Float[Array, " n"]:
-    """The rates of the momenta."""
-    force, _ = rate(terms, t, y, args)
-    return jfu.ravel_pytree(force)[0]
-
-
-def _drift_field(terms: Terms, args: Args, t: Array, y: Y) -> Float[Array, " n"]:
-    """The rate of the state."""
-    return jfu.ravel_pytree(rate(terms, t, y, args))[0]
-
-
-def _noise_field(terms: Terms, args: Args, t: Array, y: Y) -> Float[Array, " n"]:
-    """The change of the state by noise, for arbitrary increments of size one."""
-    zeros, unravel = zeros_and_unravel([control_struct(term, t) for term in terms])
-    controls = unravel(jnp.cos(1.0 + jnp.arange(zeros.size, dtype=zeros.dtype)))
-    return jfu.ravel_pytree(apply(terms, controls, args, t, y))[0]
-
-
-def _all_fields(
-    drift: Terms, noise: Terms, args: Args, t: Array, y: Y
-) -> Float[Array, " n"]:
-    """The rate of the drift with its friction, and the change by noise."""
-    fields = []
-    if drift:
-        fields.append(_drift_field(drift, args, t, y))
-    if noise:
-        fields.append(_noise_field(noise, args, t, y))
-    return jnp.concatenate(fields)
-
-
-def _depends_on_time(field: _Field, problem: Problem, y0: Y) -> bool:
-    """Whether a field reads the time, by its dependence, not by its values."""
-    dependence = Dependence(lambda t: field(t, y0), jnp.asarray(problem.t0))
-    return not dependence.independent(lambda t: t)
 
 
 def _steps_of(problem: Problem) -> _Steps | None:
@@ -239,7 +197,7 @@ def _steps_of(problem: Problem) -> _Steps | None:
 
 
 def _times_of_jumps(
-    field: _Field, problem: Problem, steps: _Steps
+    field: Field, problem: Problem, steps: _Steps
 ) -> Float[np.ndarray, " jumps"]:
     """When a field jumps within steps, not at their ends."""
     # Jumps this near to the end of a step do as little harm as those at it.
@@ -254,7 +212,7 @@ def _times_of_jumps(
 
 
 def _search(
-    field: _Field,
+    field: Field,
     y0: Y,
     ends: Float[Array, "steps 2"],
     halvings: int,
@@ -262,7 +220,7 @@ def _search(
 ) -> tuple[Float[Array, " searched"], Bool[Array, " searched"]]:
     """For the steps between these `ends` in which a field changes most: when it does, and
     whether this is a jump."""
-    at_both = _at_both(field, y0)
+    at_both = at_both_states(field, y0)
     near, far = near_and_far
 
     def largest_change(start_and_end: Array) -> Array:
@@ -298,9 +256,9 @@ def _search(
     return jax.vmap(jump_in)(ends[largest])
 
 
-def _first_jump_at_end(field: _Field, problem: Problem, y0: Y) -> float | None:
+def _first_jump_at_end(field: Field, problem: Problem, y0: Y) -> float | None:
     """The first end of a step at which a field jumps; `None` if there is none."""
-    if not _depends_on_time(field, problem, y0):
+    if not depends_on_time(field, problem, y0):
         return None
     steps = _steps_of(problem)
     if steps is None:
@@ -317,11 +275,11 @@ def _first_jump_at_end(field: _Field, problem: Problem, y0: Y) -> float | None:
 
 
 def _jumps(
-    field: _Field, y0: Y, times: Float[Array, "ends 5"], is_last: Bool[Array, " ends"]
+    field: Field, y0: Y, times: Float[Array, "ends 5"], is_last: Bool[Array, " ends"]
 ) -> Bool[Array, " ends"]:
     """For the end of each step, whether a field jumps there without a mean of both sides.
     `times` are those of `_Sides` and the end itself."""
-    at_both = _at_both(field, y0)
+    at_both = at_both_states(field, y0)
 
     def jumps_there(end: tuple[Array, Array]) -> Bool[Array, ""]:
         times, is_last = end
@@ -335,30 +293,6 @@ def _jumps(
         return 2 * error > sides.smooth_change
 
     return lax.map(jumps_there, (times, is_last), batch_size=_STEPS_AT_ONCE)
-
-
-def _at_both(field: _Field, y0: Y) -> Callable[[Array], Float[Array, " n"]]:
-    """The field at a time, at `y0` and at an arbitrary state, as one vector: at `y0` a
-    force that jumps may vanish, as in a trap that is stiffened while a particle rests."""
-    y0_and_moved = jtu.tree_map(lambda *leaves: jnp.stack(leaves), y0, _moved(y0))
-
-    def at_both(t: Array) -> Float[Array, " n"]:
-        return jax.vmap(field, in_axes=(None, 0))(t, y0_and_moved).reshape(-1)
-
-    return at_both
-
-
-def _moved(y0: Y) -> Y:
-    """An arbitrary state, about as large as `y0`."""
-
-    def moved_leaf(x: PyTree[Array]) -> Array:
-        x = jnp.asarray(x)
-        largest = jnp.max(jnp.abs(x), initial=0)
-        size = jnp.where(largest > 0, largest, 1)
-        direction = jnp.cos(1.0 + jnp.arange(x.size, dtype=x.dtype))
-        return x + size * direction.reshape(x.shape)
-
-    return jtu.tree_map(moved_leaf, y0)
 
 
 _quick_search = quickly_compiled(_search)

@@ -12,6 +12,7 @@ from .arguments import (
     check_gaussian,
     checked_key,
     has_discrete_increments,
+    is_multiple,
     warn_of_truncation,
 )
 from .engines import (
@@ -21,7 +22,14 @@ from .engines import (
     state_itself,
     warn_of_stragglers,
 )
-from .levels import combinations, Combination, Level, level_weights
+from .levels import (
+    combinations,
+    Combination,
+    finer_change_weights,
+    Level,
+    level_weights,
+    with_next_level,
+)
 from .loop import (
     mask_like,
     independent_motion,

@@ -217,7 +217,7 @@ def check_cells(terms: PyTree, t0: float, h: float) -> None:
         cell = getattr(path, "cell", None)
         if cell is None:
             continue
-        if not (_is_multiple(t0, cell) and _is_multiple(h, cell)):
+        if not (is_multiple(t0, cell) and is_multiple(h, cell)):
             raise ValueError(
                 f"Steps of a `{type(path).__name__}` with `cell` must begin and end at "
                 f"multiples of `cell`; got cell={cell}, t0={t0} and the smallest step {h}. "
@@ -225,7 +225,8 @@ def check_cells(terms: PyTree, t0: float, h: float) -> None:
             )
 
 
-def _is_multiple(time: float, cell: float) -> bool:
+def is_multiple(time: float, cell: float) -> bool:
+    """Whether a time is a whole number of cells, up to rounding."""
     quotient = time / cell
     return abs(quotient - round(quotient)) <= _CELL_ROUNDING
 

@@ -51,6 +51,17 @@ def levels_of(dt0: float, steps_of_dt0: StepNumbers, levels: int, dtype: Any) ->
     )
 
 
+def with_next_level(levels: Level) -> Level:
+    """The levels, and one more."""
+    saved_steps = np.asarray(levels.saved_steps)
+    return Level(
+        index=np.append(levels.index, levels.index[-1] + 1),
+        h=np.append(levels.h, levels.h[-1] / 2),
+        num_steps=np.append(levels.num_steps, 2 * levels.num_steps[-1]),
+        saved_steps=np.concatenate([saved_steps, 2 * saved_steps[-1:]]),
+    )
+
+
 class Combination(enum.IntEnum):
     """The rows of `level_weights`."""
 
@@ -102,6 +113,16 @@ def level_weights(
         miss = last_change - 2.0**-power * change_before
         rows += [last_change, change_before, miss]
     return np.stack(rows)
+
+
+def finer_change_weights(
+    order: int | float, levels: int
+) -> Float[np.ndarray, " levels_and_one"]:
+    """The combination of the means on `levels` levels and one more that is the change of
+    the extrapolation to step size zero, if the coarsest level is left out for the finest.
+    """
+    weights = _extrapolation_weights(order, levels)
+    return np.append(0.0, weights) - np.append(weights, 0.0)
 
 
 def _extrapolation_weights(

@@ -169,10 +169,7 @@ class Problem(eqx.Module):
         check_cells(terms, float(t0), smallest_step)
 
         all_levels = levels_of(float(dt0), steps_of_dt0, levels, t0_of_dtype.dtype)
-        # Solvers of other packages have no `weak_order`, and solvers of the user may not
-        # state theirs: it counts as 1.
-        order = getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
-        weights = np.asarray(level_weights(order, levels), jnp.result_type(float))
+        weights = level_weights(_order_of(solver, terms), levels)
         return Problem(
             phi=phi,
             terms=terms,
@@ -183,7 +180,7 @@ class Problem(eqx.Module):
             y0_of=y0_of,
             args_of=args_of,
             levels=all_levels,
-            weights=weights,
+            weights=np.asarray(weights, jnp.result_type(float)),
             at_end=ts is None,
             motion_numbers=motion_numbers(brownian_paths(terms)),
             finest_steps=int(all_levels.num_steps[-1]),
@@ -194,6 +191,11 @@ class Problem(eqx.Module):
         if is_traced(index):
             return jtu.tree_map(lambda x: jnp.asarray(x)[index], self.levels)
         return jtu.tree_map(lambda x: x[index], self.levels)
+
+    @property
+    def order(self) -> int | float:
+        """The weak order by which means are extrapolated."""
+        return _order_of(self.solver, self.terms)
 
     @property
     def paths_differ(self) -> bool:
@@ -334,6 +336,12 @@ class Problem(eqx.Module):
         """The number `S` of times at which to average, and `m` of components of `phi`."""
         m = jax.eval_shape(lambda: self.values(self.t0, self.y0)).size
         return self.levels.saved_steps.shape[1], m
+
+
+def _order_of(solver: diffrax.AbstractSolver, terms: PyTree) -> int | float:
+    """The weak order of a solver. Solvers of other packages have no `weak_order`, and
+    solvers of the user may not state theirs: it counts as 1."""
+    return getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
 
 
 def _truncated_where_needed(
