@@ -1,5 +1,5 @@
-"""Drives that steps do not resolve are told: if a step is a multiple of the period, no level
-sees them."""
+"""Drives that steps do not resolve are told, which no level sees if its steps are multiples
+of the period."""
 
 import warnings
 
