@@ -170,11 +170,12 @@ def expectation(
     by more than the standard error, if a few samples account for most of the variance, if
     all samples are equal or underflow, if a fit was dropped or takes long, and if `phi` is
     not smooth and a trial with Gaussian increments has another mean than discrete ones. Of
-    the steps: if two levels do not agree, if steps are too long at `y0` for an explicit
-    solver, for [`diffrax_symplectic.StrangGauss`][], for the noise or for the friction, if
-    forces or noise jump in time within a step, or at its end where the solver takes them,
-    and if rounding in single precision may
-    exceed the standard error.
+    the steps: if two levels do not agree; if steps are too long at `y0` for an explicit
+    solver, for [`diffrax_symplectic.StrangGauss`][], for the noise, for the friction or for
+    another decay; if forces or noise jump in time within a step, or at its end where the
+    solver takes them, or change too fast for the steps; if none of these is the case, but a
+    third level on at most 512 paths changes a mean of two levels by more than its error;
+    and if rounding in single precision may exceed the standard error.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and

@@ -1,5 +1,6 @@
 """Whether steps are too long for the friction of Langevin terms, where paths start."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -51,6 +52,12 @@ _VELOCITIES = 16
 _DOUBLINGS = 16
 
 
+# The cosine of the angle up to which changes count as parallel.
+_PARALLEL = 0.9
+
+_Linear = Callable[[Array], Array]
+
+
 class _Rates(NamedTuple):
     """The largest rates of the equation at the start.
 
@@ -73,11 +80,13 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
         return None
     if constraint_of(problem.terms) is not None:
         return None
-    _, friction, noise = split_friction(problem.terms)
-    if not friction or not noise:
-        return None
+    drift, friction, noise = split_friction(problem.terms)
     record = solver.record
     most = None if record is None else record.most_friction
+    if drift and noise and not friction and most is not None:
+        return _unresolved_decay(problem, dt0, most)
+    if not friction or not noise:
+        return None
     has_flow = isinstance(solver, AbstractLangevinSplitting) and solver.flow is not None
     may_change = _depends_on_positions(problem, friction)
     if most is None and not has_flow and not may_change:
@@ -104,6 +113,20 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
     if may_change and friction_of_step > _HARDLY_DAMPED:
         return _unresolved_change(problem, dt0, friction_of_step)
     return None
+
+
+def _unresolved_decay(problem: Problem, dt0: float, most: float) -> str | None:
+    """`unresolved_friction` for friction that is a part of the drift, such as the loss of a
+    wave. Only a state that decays hardly oscillating counts."""
+    decay = float(_quick_decay(problem)) * dt0
+    if not decay > most:
+        return None
+    return (
+        f"Steps of `dt0={dt0:g}` do not resolve a decay: where paths start, the drift "
+        f"damps the state at a rate of {decay:.3g} / `dt0`, and "
+        f"`{type(problem.solver).__name__}` has the right size of fluctuations only up to "
+        f"{most:g} / `dt0`. Pass a smaller `dt0`."
+    )
 
 
 def _unresolved_change(
@@ -226,9 +249,43 @@ def _rates(problem: Problem) -> _Rates:
     return _Rates(_largest_decay(damped, flat_p), _largest_decay(accelerated, flat_p))
 
 
-def _largest_decay(derivative, like: Float[Array, " n"]) -> Float[Array, ""]:
+def _decay(problem: Problem) -> Float[Array, ""]:
+    """The rate at which the drift damps the state, at `y0`, in the direction in which it
+    changes most; zero if the state grows or oscillates there."""
+    drift, _, _ = split_friction(problem.terms)
+    flat_y0, unravel = jfu.ravel_pytree(problem.y0)
+
+    def rate_of_drift(x: Array) -> Array:
+        dy = rate(drift, problem.t0, unravel(x), problem.args)
+        return jfu.ravel_pytree(dy)[0]
+
+    def derivative(change: Array) -> Array:
+        return jax.jvp(rate_of_drift, (flat_y0,), (change,))[1]
+
+    change = _changing_most(derivative, flat_y0)
+    once = derivative(change)
+    twice = derivative(once)
+    # An oscillation may be turned around once, if its parts have different units, but then
+    # not back.
+    turns_around = _cosine(change, once) < -_PARALLEL
+    turns_back = _cosine(change, twice) > _PARALLEL
+    return jnp.where(turns_around & turns_back, jnp.linalg.norm(once), 0)
+
+
+def _cosine(x: Float[Array, " n"], y: Float[Array, " n"]) -> Float[Array, ""]:
+    """Of the angle between two vectors; not a number if one is zero."""
+    return x @ y / (jnp.linalg.norm(x) * jnp.linalg.norm(y))
+
+
+def _largest_decay(derivative: _Linear, like: Float[Array, " n"]) -> Float[Array, ""]:
     """Minus the eigenvalue of `derivative` that is largest in size, or zero if this
     eigenvalue is positive."""
+    change = _changing_most(derivative, like)
+    return jnp.maximum(-(change @ derivative(change)), 0)
+
+
+def _changing_most(derivative: _Linear, like: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The change, of length one, that `derivative` changes most, by power iteration."""
 
     def iterate(_, change: Array) -> Array:
         image = derivative(change)
@@ -237,9 +294,9 @@ def _largest_decay(derivative, like: Float[Array, " n"]) -> Float[Array, ""]:
 
     # An arbitrary direction, without the symmetries that a problem may have.
     start = jnp.cos(1.0 + jnp.arange(like.size, dtype=like.dtype))
-    change = lax.fori_loop(0, _ITERATIONS, iterate, start / jnp.linalg.norm(start))
-    return jnp.maximum(-(change @ derivative(change)), 0)
+    return lax.fori_loop(0, _ITERATIONS, iterate, start / jnp.linalg.norm(start))
 
 
 _quick_rates = quickly_compiled(_rates)
 _quick_change = quickly_compiled(_change_along_step)
+_quick_decay = quickly_compiled(_decay)

@@ -71,12 +71,15 @@ class Combination(enum.IntEnum):
     # last extrapolation.
     BIAS = 1
     EXTRAPOLATION = 2
+    # What the last extrapolation would change if it eliminated the first power of the error
+    # only. With two levels these are the same.
+    BY_FIRST_POWER = 3
     # With three levels or more, for the extrapolations from all but two neighbouring levels
     # (from one level of three): the change to the last of these three and to the one
     # before, and the former minus what the order foretells from the latter.
-    LAST = 3
-    BEFORE = 4
-    MISS = 5
+    LAST = 4
+    BEFORE = 5
+    MISS = 6
 
 
 def level_weights(
@@ -98,7 +101,9 @@ def level_weights(
     # step size less.
     best_without_coarsest = np.append(0.0, _extrapolation_weights(order, levels - 1))
     finest = np.eye(levels)[-1]
-    rows = [best, finest - best, best - best_without_coarsest]
+    change = finer_change_weights(order, levels - 1)
+    by_first_power = change / (2.0**order - 1)
+    rows = [best, finest - best, best - best_without_coarsest, by_first_power]
     if levels > 2:
         # The extrapolations from all but two neighbouring levels, of which there are three.
         weights = _extrapolation_weights(order, levels - 2)

@@ -2,6 +2,7 @@
 
 import warnings
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -174,6 +175,63 @@ def test_with_three_levels_the_order_is_checked_instead():
     assert _told(terms, ds.SRKw5(), 0.2, REST)[1]
     assert not _told(terms, ds.SRKw5(), 0.2, REST, levels=3)[1]
     assert not _told(terms, ds.SRKw5(), 0.2, REST, levels=1)[1]
+
+
+KICK = ds.noise_terms(lambda t, p, q, args: 0.1 * q, ())
+DISPLACED = jnp.array(1.0), jnp.array(0.5)
+
+
+def _is_told_of_drift(matrix, h, solver):
+    """Whether a warning tells of the decay by a linear drift with this matrix."""
+
+    def drift(t, y, args):
+        p, q = jnp.array(matrix) @ jnp.stack(y)
+        return p, q
+
+    terms = diffrax.MultiTerm(diffrax.ODETerm(drift), KICK)
+    phi = lambda t, y, args: y[0] ** 2
+    return _told(terms, solver, h, DISPLACED, phi)[1]
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
+@pytest.mark.parametrize("solver, most", [(ds.AdditiveGauss(), 2.0), (ds.SRKw5(), 0.5)])
+def test_a_loss_that_is_a_term_of_its_own_is_told_beyond_the_same_limit(
+    scale, solver, most
+):
+    for matrix in ([[-1.0, 0.0], [0.0, -1.0]], [[-1.0, -0.1], [0.1, -1.0]]):
+        rates = np.array(matrix) / scale
+        assert not _is_told_of_drift(rates, 0.9 * most * scale, solver)
+        assert _is_told_of_drift(rates, 1.1 * most * scale, solver)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        [[0.0, -1.0], [1.0, 0.0]],
+        [[0.0, -1e4], [1.0, 0.0]],
+        [[0.0, -1.0], [1e4, 0.0]],
+        [[-0.1, -100.0], [1.0, 0.0]],
+        [[0.0, 100.0], [1.0, 0.0]],
+        [[0.0, 0.0], [1.0, 0.0]],
+    ],
+    ids=["oscillator", "stiff", "light", "damped", "saddle", "free"],
+)
+def test_oscillations_and_growth_are_no_decay(matrix):
+    frequency = max(np.abs(np.linalg.eigvals(np.array(matrix)))) or 1.0
+    assert not _is_told_of_drift(matrix, 3 / frequency, ds.AdditiveGauss())
+
+
+def test_a_lossy_mode_is_far_too_hot_on_both_levels_and_told():
+    rate, T = 1e4, 0.01
+    kick = ds.noise_terms(lambda t, p, q, args: jnp.sqrt(2 * rate * T) * q, ())
+    loss = diffrax.ODETerm(lambda t, y, args: (-rate * y[0], -rate * y[1]))
+    phi = lambda t, y, args: y[0] ** 2
+    terms = diffrax.MultiTerm(loss, kick)
+    sampling = ds.IndependentPaths(8192)
+    options = dict(sampling=sampling)
+    got, is_told = _told(terms, ds.AdditiveGauss(), 1.0, DISPLACED, phi, **options)
+    assert got.mean - T > 10 * got.error
+    assert is_told
 
 
 def test_the_warning_names_the_line_of_the_user():

@@ -234,11 +234,22 @@ def is_off_order(last: Any, miss: Any, miss_error: Any) -> np.ndarray:
 
 
 def remaining_error(
-    off_order: Any, extrapolation: Any, last: Any, before: Any
+    extrapolation: Any, by_first_power: Any, noise: Any
+) -> np.ndarray | np.floating:
+    """An estimate of the discretization error that remains, from the change by the last
+    `extrapolation`, and from this change as it were if it eliminated the first power of the
+    step size only, with its standard error, `noise`.
+
+    (By the former alone, of harmonic oscillators over long times by four and five levels, 5
+    to 12% of the means were more than two error bars off; by both it is 0 to 2%.)"""
+    sure = np.abs(by_first_power) - _ERRORS_BY_CHANCE * noise
+    return np.maximum(np.abs(extrapolation), sure)
+
+
+def largest_if_off_order(
+    off_order: Any, size: Any, last: Any, before: Any
 ) -> np.ndarray:
-    """An estimate of the discretization error that remains: the size of the change by the
-    last `extrapolation`, or where the changes do not fit the order, of the largest among
-    it, the `last` change by a smaller step and the change `before`."""
-    size = np.abs(extrapolation)
+    """The `size` of the error that remains, or where the changes do not fit the order, the
+    largest among it, the `last` change by a smaller step and the change `before`."""
     largest_change = np.maximum(np.abs(last), np.abs(before))
     return np.where(off_order, np.maximum(size, largest_change), size)

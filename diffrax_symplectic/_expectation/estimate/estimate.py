@@ -12,7 +12,13 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ..._simulation import Combination
-from .error_bars import is_off_order, remaining_error, Results, results_of
+from .error_bars import (
+    is_off_order,
+    largest_if_off_order,
+    remaining_error,
+    Results,
+    results_of,
+)
 from .moments import combined_in_halves, Moments, total
 from .saved import arrays_of, fields_from, header_of
 
@@ -156,16 +162,25 @@ class Expectation(eqx.Module):
         quarter of that, or more than four thirds, by more than two standard errors, then
         the larger of these changes is taken instead, and the printed estimate says so. With
         $L > 3$ levels the same holds for the extrapolations from $L - 2$ neighbouring
-        levels, of order $p + L - 3$."""
+        levels, of order $p + L - 3$. The order $p + L - 2$ of the last extrapolation is not
+        checked. So its change is taken for at least as large as if it were of order $p$,
+        less two standard errors."""
         if self.levels == 1:
             return None
-        remaining = self._results(Combination.EXTRAPOLATION).mean
+        extrapolation = self._results(Combination.EXTRAPOLATION).mean
         off_order = self.off_order
         if off_order is None:
-            return jtu.tree_map(np.abs, remaining)
+            return jtu.tree_map(np.abs, extrapolation)
+        by_first_power = self._results(Combination.BY_FIRST_POWER)
+        size = jtu.tree_map(
+            remaining_error,
+            extrapolation,
+            by_first_power.mean,
+            by_first_power.std_error,
+        )
         last = self._results(Combination.LAST).mean
         before = self._results(Combination.BEFORE).mean
-        return jtu.tree_map(remaining_error, off_order, remaining, last, before)
+        return jtu.tree_map(largest_if_off_order, off_order, size, last, before)
 
     @property
     def failed_error(self) -> _Host:
