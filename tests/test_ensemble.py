@@ -100,6 +100,7 @@ def test_a_shape_becomes_a_path_with_gaussian_increments_unless_a_weak_one_is_wa
         follow(**once, want="sharp")
 
 
+@pytest.mark.core
 @both_engines
 def test_without_times_the_ends_are_returned(engine):
     ends, saved = follow(engine=engine), follow(engine=engine, ts=[1.0])

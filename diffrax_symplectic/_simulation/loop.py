@@ -246,7 +246,13 @@ def _vmapped_in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
     has_whole_blocks = num_paths > _PATHS_AT_ONCE and num_paths % _PATHS_AT_ONCE == 0
     if not has_whole_blocks or jax.default_backend() != "cpu":
         return jax.vmap(fn)(*args)
-    return lax.map(lambda args: fn(*args), args, batch_size=_PATHS_AT_ONCE)
+
+    def in_blocks(x: Array) -> Array:
+        return x.reshape(-1, _PATHS_AT_ONCE, *x.shape[1:])
+
+    # With `batch_size=`, older versions of JAX trace a remainder of no paths, too.
+    results = lax.map(lambda block: jax.vmap(fn)(*block), jtu.tree_map(in_blocks, args))
+    return jtu.tree_map(lambda x: x.reshape(num_paths, *x.shape[2:]), results)
 
 
 def mask_like(mask: Bool[Array, " n"], x: Array) -> Array:

@@ -64,6 +64,7 @@ def test_the_estimate_is_exact_up_to_the_spread_that_it_reports():
     np.testing.assert_allclose(high - low, 2 * 2.13145 * got.std_error, rtol=1e-5)
 
 
+@pytest.mark.core
 def test_paths_in_blocks_are_those_of_one_batch(monkeypatch):
     whole = _estimate(phi=SQUARE, levels=2)
     # Another function, so that programs are compiled anew.
