@@ -227,11 +227,16 @@ def expectation(
     _warn_of_rounding(estimate, problem)
     # Warnings of the problem come with its first samples, and not again with later parts.
     if start is None and first == 0:
-        for message in _messages_on_steps(estimate, problem, float(dt0), key, devices):
+        try:
+            messages = _messages_on_steps(estimate, problem, float(dt0), key, devices)
+            if has_kinks(problem):
+                messages += _messages_on_law(estimate, problem, key, devices)
+        except ExpectationInterrupted:
+            # What was interrupted is a trial, and its estimate is not that of the call.
+            raise ExpectationInterrupted(estimate) from None
+        for message in messages:
             warnings.warn(message, stacklevel=2)
         warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
-        if has_kinks(problem):
-            _warn_of_law(estimate, problem, key, devices)
     return estimate
 
 
@@ -264,23 +269,21 @@ def _messages_on_steps(
     return messages
 
 
-def _warn_of_law(
+def _messages_on_law(
     estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: Devices
-) -> None:
-    """Warns if discrete increments change the mean of a `phi` that may not be smooth, by a
+) -> list[str]:
+    """Whether discrete increments change the mean of a `phi` that may not be smooth, by a
     trial with Gaussian increments."""
     paths = random_paths(problem.terms)
     laws = [law for path in paths for law in (laws_of(path) or {}).values()]
     if not any(isinstance(law, Discrete) for law in laws):
-        return
+        return []
     if has_discrete_increments(problem.solver):
-        warnings.warn(
+        return [
             f"`phi` may not be smooth, and `{type(problem.solver).__name__}` has discrete "
             "increments alone, which have the right means of smooth functions only. Pass "
-            'a solver of `suggest_solver(terms, t0, y0, args, want="strong")`.',
-            stacklevel=3,
-        )
-        return
+            'a solver of `suggest_solver(terms, t0, y0, args, want="strong")`.'
+        ]
     trial = _trial_with_gaussian_increments(problem, key, devices)
 
     def is_different(change: np.ndarray, error: np.ndarray) -> np.bool_:
@@ -288,16 +291,16 @@ def _warn_of_law(
 
     changes = jtu.tree_map(lambda x, y: np.abs(x - y), estimate.mean, trial.mean)
     errors = jtu.tree_map(np.hypot, estimate.std_error, trial.std_error)
-    if any(jtu.tree_leaves(jtu.tree_map(is_different, changes, errors))):
-        warnings.warn(
-            "`phi` is not smooth, and its mean changes by up to "
-            f"{largest_error(changes):.1e} with Gaussian increments, which is more than "
-            "the error of the estimate: the discrete increments of a `WeakBrownianPath` "
-            "(and of `ValueFunctions`) are for smooth functions. Pass the shape in place "
-            "of the path in `terms`, or a `FixedStepBrownianPath`, and another `sampling` "
-            "than `ValueFunctions`.",
-            stacklevel=3,
-        )
+    if not any(jtu.tree_leaves(jtu.tree_map(is_different, changes, errors))):
+        return []
+    return [
+        "`phi` is not smooth, and its mean changes by up to "
+        f"{largest_error(changes):.1e} with Gaussian increments, which is more than the "
+        "error of the estimate: the discrete increments of a `WeakBrownianPath` (and of "
+        "`ValueFunctions`) are for smooth functions. Pass the shape in place of the path "
+        "in `terms`, or a `FixedStepBrownianPath`, and another `sampling` than "
+        "`ValueFunctions`."
+    ]
 
 
 def _trial_with_gaussian_increments(

@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
@@ -12,18 +13,23 @@ from .._simulation import Problem
 from .fields_in_time import all_fields, at_both_states, depends_on_time, Field
 
 
-# The most steps that are looked at, spread over the interval, and at how many times within
-# each. Multiples of the golden ratio, without their whole parts, fill an interval evenly,
-# and no period repeats in step with them.
-_STEPS = 256
-_TIMES = 8
+# The most times that are looked at, spread over the interval: a pulse is seen if it is
+# longer than the time between them. Fewer for large systems, so that no more than so many
+# numbers are computed, in some tenths of a second; but so many in each step.
+_MOST_TIMES = 2**16
+_MOST_NUMBERS = 2**22
+_TIMES_IN_STEP = 16
+_FEWEST_STEPS = 2**6
+# Multiples of this number, without their whole parts, fill an interval evenly, and no
+# period repeats in step with them.
 _GOLDEN_RATIO = (1 + 5**0.5) / 2
 # How far fields depart from straight lines over a step, as a part of their whole change in
-# it, in the root mean square. A drive of frequency Omega reaches this at Omega h = 3.7.
+# it, in the root mean square. A drive of frequency Omega reaches this at Omega h = 3.5 to
+# 4.1, with many and with 16 times in a step.
 # Measured on a damped oscillator that is driven at random phases, by `BAOAB` and the
 # midpoint rule: up to 4, for the shorter of two steps, one mean in twenty is more than two
 # error bars off; beyond, up to nineteen in twenty, by a thousand bars and more.
-_UNRESOLVED = 0.9
+_UNRESOLVED = 1.0
 # Changes of less than this part of a field are too small to look at.
 _SMALL = 1e-3
 
@@ -40,17 +46,24 @@ def unresolved_drive(problem: Problem) -> str | None:
     if not depends_on_time(field, problem, problem.y0):
         return None
     h = float(problem.levels.h[-1])
-    fractions = np.sort(np.arange(1, _TIMES + 1) * _GOLDEN_RATIO % 1)
-    numbers = np.floor(np.arange(_STEPS) * _GOLDEN_RATIO % 1 * problem.finest_steps)
-    numbers = np.unique(numbers)
+    size = sum(leaf.size for leaf in jtu.tree_leaves(problem.y0))
+    most_times = min(_MOST_TIMES, _MOST_NUMBERS // max(size, 1))
+    most_steps = max(_FEWEST_STEPS, most_times // _TIMES_IN_STEP)
+    numbers = np.arange(problem.finest_steps)
+    if len(numbers) > most_steps:
+        fractions = np.arange(most_steps) * _GOLDEN_RATIO % 1
+        numbers = np.unique(np.floor(fractions * problem.finest_steps))
+    times_in_step = max(_TIMES_IN_STEP, most_times // len(numbers))
+    fractions = np.sort(np.arange(1, times_in_step + 1) * _GOLDEN_RATIO % 1)
     times = float(problem.t0) + h * (numbers[:, None] + fractions)
     departure = _quick_departure(field, problem.y0, times.astype(problem.dtype))
     if not float(departure) > _UNRESOLVED:
         return None
     return (
         f"The forces or the noise change in time too fast for steps of {h:.3g}, the "
-        "shortest of all levels. If a step is a multiple of a period, no level sees any "
-        "change, and all agree on a wrong mean. Pass a `dt0` below a third of the period."
+        "shortest of all levels. Where a pulse is shorter than a step, or a step is a "
+        "multiple of a period, no level may see it, and all agree on a wrong mean. Pass a "
+        "`dt0` below a third of the pulse or period."
     )
 
 

@@ -162,7 +162,8 @@ def check_noise(terms: PyTree) -> None:
     if len(paths) == 0:
         raise ValueError(
             "`terms` have no Brownian path, so nothing is random. Solve them once, with "
-            "`diffrax.diffeqsolve`."
+            "`diffrax.diffeqsolve`; for random `y0` or `args` average such solves by "
+            "`monte_carlo`."
         )
     if not any(map(is_random, paths)):
         raise ValueError(

@@ -66,6 +66,13 @@ def test_a_fast_drive_beside_a_slow_one_is_told():
     assert _told(_driven(force), ds.ImplicitMidpoint(), 0.4)[1] is not None
 
 
+@pytest.mark.parametrize("width", [0.03, 0.01, 1e-3])
+def test_a_pulse_that_falls_between_the_stages_is_told(width):
+    struck = lambda t: jnp.exp(-(((t - 10.06) / width) ** 2) / 2) / width
+    got, message = _told(_driven(struck), ds.ImplicitMidpoint(), 0.4)
+    assert message is not None
+
+
 def test_noise_that_changes_fast_is_told():
     strength = lambda t: 1 + jnp.cos(2 * jnp.pi * 10 * t)
     energy = lambda t, p, q, args: (p**2 + q**2) / 2

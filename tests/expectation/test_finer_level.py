@@ -1,10 +1,14 @@
 """A trial with a third level tells where two levels agree on a wrong mean."""
 
+import dataclasses
+import sys
 import warnings
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import jax.random as jr
+import lineax as lx
 import pytest
 
 import diffrax_symplectic as ds
@@ -104,6 +108,27 @@ def test_momenta_that_steps_hardly_damp_are_told(solver, friction):
     assert message is not None
 
 
+def test_errors_that_change_their_sign_between_the_levels_are_told():
+    # Noise turns the momenta of an oscillator in a plane, and the error of order 1 is zero
+    # between both steps. The trial takes all its paths to see that.
+    def turned(t, y, args):
+        turned_p = jnp.stack([-y[0][1], y[0][0]])
+        kick = lambda w: (turned_p * w, jnp.zeros(2))
+        return lx.FunctionLinearOperator(kick, jax.ShapeDtypeStruct((), float))
+
+    path = ds.WeakBrownianPath((), jr.key(0))
+    drift = diffrax.ODETerm(lambda t, y, args: (-y[1], y[0]))
+    terms = diffrax.MultiTerm(drift, diffrax.ControlTerm(turned, path))
+    kinetic = lambda t, y, args: jnp.sum(y[0] ** 2) / 2
+    given = kinetic, terms, ds.ImplicitMidpoint(), 0, 2.5, 0.25
+    y0 = jnp.array([1.5, 0.0]), jnp.zeros(2)
+    exactly = ds.ValueFunctions(degree=2, num_paths=64)
+    got, message = _told(*given, y0, sampling=exactly)
+    # The exponential of the equations of the moments.
+    assert abs(got.mean - 0.5997523) > 4 * got.error
+    assert "on 8192 paths" in message
+
+
 def test_a_solver_with_discrete_increments_alone_is_tried_without_common_noise():
     given = _square_of_q, DRIVEN, ds.SRKw5(), 0, 50, 1.0, DISPLACED
     got, message = _told(*given, sampling=ds.IndependentPaths(8192))
@@ -145,3 +170,16 @@ def test_later_parts_are_not_tried_again():
     sampling = ds.IndependentPaths(8192)
     assert _of_oscillator(1.0, sampling=sampling)[1] is not None
     assert _of_oscillator(1.0, sampling=sampling, first=8192)[1] is None
+
+
+def test_an_interrupted_trial_leaves_the_estimate(monkeypatch):
+    def interrupted(estimate, *rest):
+        raise ds.ExpectationInterrupted(dataclasses.replace(estimate, moments=()))
+
+    # The function of the same name hides its module.
+    module = sys.modules["diffrax_symplectic._expectation.expectation"]
+    monkeypatch.setattr(module, "changes_with_finer_level", interrupted)
+    sampling = ds.IndependentPaths(1024)
+    with pytest.raises(ds.ExpectationInterrupted) as info:
+        _of_oscillator(0.1, t1=1, sampling=sampling)
+    assert info.value.estimate.num_paths == 1024
