@@ -28,12 +28,14 @@ FLOORS = [
 ]
 # Of the folders and modules in `_expectation`.
 FLOORS_OF_EXPECTATION = [
-    ("sampling",),
-    ("estimate", "batch", "cost", "jumps", "kinks", "long_steps", "strong_friction"),
+    ("sampling", "fields_in_time"),
+    ("estimate", "batch", "cost", "kinks"),
+    ("jumps", "fast_drive", "long_steps", "strong_friction"),
     ("run", "call"),
     ("independent", "fitted", "sorted"),
     ("fused_paths",),
     ("choose",),
+    ("finer_level",),
     ("expectation", "monte_carlo"),
     ("__init__",),
 ]

@@ -11,7 +11,12 @@ from .stepwise import (
     UnspecifiedPath,
     zeros_and_unravel,
 )
-from .paths import FixedStepBrownianPath, WeakBrownianPath, WeakIncrement
+from .paths import (
+    CommonBrownianPath,
+    FixedStepBrownianPath,
+    WeakBrownianPath,
+    WeakIncrement,
+)
 from .random import AbstractLaw, check_key, derived_key, Discrete, is_key
 from .random import random_words, THREE_POINT, typed_key
 from .levy_area import LevyAreaBrownianPath, LevyAreaIncrement

@@ -109,7 +109,7 @@ def checked_cell(cell: float | None) -> float | None:
 def compose(
     t0: RealScalarLike,
     t1: RealScalarLike,
-    cell: float,
+    cell: float | Float[Array | np.ndarray, ""],
     sample: Callable[[Int[Array, ""]], Piece],
     path_name: str,
 ) -> Piece:

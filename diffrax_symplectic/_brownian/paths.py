@@ -5,6 +5,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._custom_types import BM
@@ -188,17 +189,55 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
         if self.cell is None:
             words = self.words(place_of(t0, t1), use_levy)
             return self.increment(words, t0, t1, use_levy)
-        h = jnp.asarray(self.cell, t0.dtype)
+        return _drawn_over_cells(self, self.cell, t0, t1, use_levy)
 
-        def sample(i: Array) -> Piece:
-            # The number of a cell serves as its place: it is exact, and the times of the
-            # cell are rounded.
-            place = (i.astype(jnp.int32), jnp.array(0))
-            # Areas are always drawn, so that increments do not depend on `use_levy`.
-            words = self.words(place, use_levy=True)
-            # Given the words, only the size of a step matters, not where it begins.
-            increment = self.increment(words, 0 * h, h, use_levy=True)
-            return Piece.from_increment(increment, h)
 
-        piece = compose(t0, t1, self.cell, sample, type(self).__name__)
-        return piece.as_increment(self.levy_area, self.shape, t1 - t0, use_levy)
+class CommonBrownianPath(AbstractPathWithLaws):
+    """The Brownian motion of a `FixedStepBrownianPath` with space-time Lévy area and this
+    `cell`, which may be traced here: a path with another one compiles nothing anew."""
+
+    shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
+    key: PRNGKeyArray
+    cell: Float[Array | np.ndarray, ""]
+    levy_area: ClassVar = diffrax.SpaceTimeLevyArea  # pyright: ignore
+
+    def __init__(
+        self,
+        shape: tuple[int, ...] | PyTree[jax.ShapeDtypeStruct],
+        key: PRNGKeyArray,
+        cell: Float[Array | np.ndarray, ""],
+    ):
+        self.shape = checked_shape(shape, type(self).__name__)
+        self.key = key
+        self.cell = cell
+
+    @property
+    def laws(self) -> Mapping[str, AbstractLaw]:
+        return GAUSSIAN_LAWS[self.levy_area]
+
+    def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
+        return _drawn_over_cells(self, self.cell, t0, t1, use_levy)
+
+
+def _drawn_over_cells(
+    path: AbstractPathWithLaws,
+    cell: float | Float[Array | np.ndarray, ""],
+    t0: Array,
+    t1: Array,
+    use_levy: bool,
+) -> Increment:
+    """The increment of a path whose steps are composed of cells."""
+    h = jnp.asarray(cell, t0.dtype)
+
+    def sample(i: Array) -> Piece:
+        # The number of a cell serves as its place: it is exact, and the times of the cell
+        # are rounded.
+        place = (i.astype(jnp.int32), jnp.array(0))
+        # Areas are always drawn, so that increments do not depend on `use_levy`.
+        words = path.words(place, use_levy=True)
+        # Given the words, only the size of a step matters, not where it begins.
+        increment = path.increment(words, 0 * h, h, use_levy=True)
+        return Piece.from_increment(increment, h)
+
+    piece = compose(t0, t1, cell, sample, type(path).__name__)
+    return piece.as_increment(path.levy_area, path.shape, t1 - t0, use_levy)

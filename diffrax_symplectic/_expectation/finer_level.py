@@ -17,7 +17,7 @@ from .._simulation import (
     Problem,
     with_next_level,
 )
-from .._solver import common_path
+from .._solver import path_of_array_cell
 from .._terms import (
     brownian_paths,
     has_unknown_law,
@@ -148,11 +148,11 @@ def _with_finer_level(problem: Problem, key: PRNGKeyArray) -> Problem:
     """The problem with one more level, whose single combination of levels is the change
     of the estimate by it."""
     levels = with_next_level(problem.levels)
-    finest = float(levels.h[-1])
+    finest = levels.h[-1]
     terms = problem.terms
     has_same_noise = not has_discrete_increments(problem.solver)
-    if has_same_noise and is_multiple(float(problem.t0), finest):
-        path = ft.partial(common_path, problem.solver, finest)
+    if has_same_noise and is_multiple(float(problem.t0), float(finest)):
+        path = ft.partial(path_of_array_cell, problem.solver, np.asarray(finest))
         numbers = motion_numbers(random_paths(terms))
         terms = with_paths(path, numbers, terms, key)
     weights = finer_change_weights(problem.order, len(problem.levels.h))

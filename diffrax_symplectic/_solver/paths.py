@@ -3,9 +3,11 @@
 from typing import cast
 
 import diffrax
+import numpy as np
 from jaxtyping import PRNGKeyArray, PyTree
 
 from .._brownian import (
+    CommonBrownianPath,
     FixedStepBrownianPath,
     LevyAreaBrownianPath,
     LevyAreaIncrement,
@@ -35,10 +37,29 @@ def common_path(
     path = FixedStepBrownianPath(
         shape, key, levy_area=diffrax.SpaceTimeLevyArea, cell=cell
     )
+    return _with_areas_for(solver, path, cell, key)
+
+
+def path_of_array_cell(
+    solver: diffrax.AbstractSolver, cell: np.ndarray, shape: PyTree, key: PRNGKeyArray
+) -> diffrax.AbstractBrownianPath:
+    """`common_path` with a `cell` that is an array: another one compiles nothing anew, but
+    for solvers that need Lévy areas of pairs of noises."""
+    path = CommonBrownianPath(shape, key, cell)
+    return _with_areas_for(solver, path, float(cell), key)
+
+
+def _with_areas_for(
+    solver: diffrax.AbstractSolver,
+    path: diffrax.AbstractBrownianPath,
+    cell: float | None,
+    key: PRNGKeyArray,
+) -> diffrax.AbstractBrownianPath:
+    """The path with the further variables that the solver needs."""
     increment = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
     if increment is PlateauIncrement:
         return PlateauBrownianPath(path, key)
     if increment is LevyAreaIncrement:
-        num_terms = 0 if cell else 2
+        num_terms = 2 if cell is None else 0
         return LevyAreaBrownianPath(path, key, num_terms=num_terms, cell=cell)
     return path

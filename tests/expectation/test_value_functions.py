@@ -377,7 +377,7 @@ def test_the_default_is_the_same_each_time_and_goes_on_with_itself():
     assert isinstance(got.sampling, ds.ValueFunctions) and got.tol_reached
     # Three levels: two leave more of the discretization error.
     assert got.reason.startswith(
-        "value functions for 2 components of the state, 28 steps of 3"
+        "value functions for 2 components of the state, 60 steps of 3"
     )
     again, more = estimate(tol=1e-6), estimate(start=got)
     assert (again.mean, again.std_error) == (got.mean, got.std_error)
