@@ -30,6 +30,7 @@ from .._terms import (
     split_friction,
     tree_sum,
 )
+from .fields_in_time import drift_field
 
 
 # With a flow, a mode that turns by more than this in a step, and whose momentum decays at
@@ -50,8 +51,6 @@ _HARDLY_DAMPED = 1.0
 # 2^-16 of the largest rate have forgotten where they began.
 _VELOCITIES = 16
 _DOUBLINGS = 16
-
-
 # The cosine of the angle up to which changes count as parallel.
 _PARALLEL = 0.9
 
@@ -253,11 +252,11 @@ def _decay(problem: Problem) -> Float[Array, ""]:
     """The rate at which the drift damps the state, at `y0`, in the direction in which it
     changes most; zero if the state grows or oscillates there."""
     drift, _, _ = split_friction(problem.terms)
+    field = drift_field(drift, problem.args)
     flat_y0, unravel = jfu.ravel_pytree(problem.y0)
 
     def rate_of_drift(x: Array) -> Array:
-        dy = rate(drift, problem.t0, unravel(x), problem.args)
-        return jfu.ravel_pytree(dy)[0]
+        return field(jnp.asarray(problem.t0), unravel(x))
 
     def derivative(change: Array) -> Array:
         return jax.jvp(rate_of_drift, (flat_y0,), (change,))[1]
