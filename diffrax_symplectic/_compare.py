@@ -20,6 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree
 from ._arguments import check_real, check_solver, check_takes, check_untraced, shapes
 from ._custom_types import Args, RealScalarLike, Y
 from ._lapack import lapack_in_turn
+from ._programs import traced
 from ._solver import common_path, own_path
 from ._suggest import suggest_solver
 from ._terms import (
@@ -28,6 +29,7 @@ from ._terms import (
     random_paths,
     shapes_as_paths,
     with_paths,
+    with_programs,
     without_truncation,
 )
 
@@ -209,6 +211,8 @@ def compare_solvers(
     _check_solvers(solvers, reference)
     if phi is not None:
         _check_scalar(phi, t1, y0, args)
+        phi = traced(phi, jnp.asarray(t1, float), y0, args)
+    terms = with_programs(terms, t0, y0, args)
     system = _ComparedSystem(terms, t0, t1, y0, args, phi, key, num_paths)
     reference_dt = min(dts) / _REFERENCE_STEPS
     solve_for_reference = system.solve_to_compare(reference, reference_dt)
@@ -266,6 +270,7 @@ class _ComparedSystem(NamedTuple):
         """The function that solves along the paths of `make_path`, as for `with_paths`,
         compiled."""
         terms, t0, t1, y0, args, phi, *_ = self
+        solver = with_programs(solver, t0, y0, args)
         # Terms that share a path share a path again.
         numbers = motion_numbers(random_paths(terms))
 

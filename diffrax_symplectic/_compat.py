@@ -69,36 +69,10 @@ def is_closure_mismatch(error: ValueError) -> bool:
     return "Closure-converted function" in str(error)
 
 
-def quickly_compiled(fn: Callable) -> Callable:
-    """`equinox.filter_jit(fn)`, compiled by XLA's older generator of code for CPUs where
-    this version of XLA has it.
-
-    The program of a fit takes 2.6 to 5 s of processor time to compile by the newer
-    generator, and 1.8 to 3.2 s by the older one. Both programs run at the same speed.
-    """
-
-    @ft.cache
-    def compiled() -> Callable:
-        # Equinox hands on all other options to `jax.jit`, which its types do not say.
-        jit: Any = eqx.filter_jit
-        return jit(fn, compiler_options=_quick_options())
-
-    @ft.wraps(fn)
-    def call(*args: Any) -> Any:
-        try:
-            return compiled()(*args)
-        except ValueError as error:
-            # JAX refuses options for a program inside of another, or one that captures
-            # values of another, before it calls `fn`. It has no class of errors for this.
-            if "`compiler_options`" not in str(error):
-                raise
-        return eqx.filter_jit(fn)(*args)
-
-    return call
-
-
 @ft.cache
-def _quick_options() -> dict[str, bool]:
+def quick_options() -> dict[str, bool]:
+    """Options by which XLA compiles with its older generator of code for CPUs, if it has
+    it."""
     options = {"xla_cpu_use_fusion_emitters": False}
     try:
         jax.jit(lambda: 0, compiler_options=options).lower().compile()
@@ -191,6 +165,46 @@ def with_captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[An
 def is_program(x: Any) -> bool:
     """Whether this is a jaxpr, among the parameters of an operation."""
     return isinstance(x, Jaxpr | ClosedJaxpr)
+
+
+def is_rule(x: Any) -> bool:
+    """Whether this parameter of an operation is a function, such as the rule of a custom
+    derivative, or a callback. JAX wraps some of these in objects that are not callable."""
+    return callable(x) and not isinstance(x, type) or hasattr(x, "call_wrapped")
+
+
+def with_constants_for(jaxpr: Jaxpr, places: Sequence[tuple[int, int]]) -> Jaxpr:
+    """A program with new constants, after those that it has, in these places: each is the
+    number of an operation and that of its argument."""
+    structs = [
+        jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype)
+        for x in (jaxpr.eqns[k].invars[place] for k, place in places)
+    ]
+    # Versions of JAX construct variables from different arguments: here it does so itself.
+    new_constants = jax.make_jaxpr(lambda *xs: xs)(*structs).jaxpr.invars
+    eqns = list(jaxpr.eqns)
+    for (k, place), constant in zip(places, new_constants):
+        invars = list(eqns[k].invars)
+        invars[place] = constant
+        eqns[k] = eqns[k].replace(invars=invars)
+    return jaxpr.replace(eqns=eqns, constvars=[*jaxpr.constvars, *new_constants])
+
+
+# Not to be made while other threads use JAX.
+_numbered_traces = jax.make_user_context(0)
+
+
+def with_traces_of(number: int) -> Any:
+    """A context in which JAX uses only those of its traces that were made in the same one.
+    It keeps those of functions within others, such as `diffrax.diffeqsolve`, by the
+    identity of what they are called with."""
+    return _numbered_traces(number)
+
+
+def evaluated(jaxpr: Jaxpr, consts: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
+    """The results of a program. Operations keep the lines of the user's code that they come
+    from, by which messages name them."""
+    return jax.core.eval_jaxpr(jaxpr, consts, *inputs)
 
 
 def programs_in(eqn: JaxprEqn) -> list[Jaxpr]:

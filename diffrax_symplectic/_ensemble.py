@@ -192,6 +192,7 @@ def ensemble(
         levels=1,
         want=want,
         caller="ensemble",
+        key=key,
     )
     if want == "strong" and any(which_are_shapes(terms)):
         check_gaussian(solver)

@@ -56,6 +56,7 @@ from ._terms import (
     which_need_truncation,
     with_paths,
     with_paths_for_shapes,
+    with_programs,
     without_constraint,
     without_truncation,
 )
@@ -177,9 +178,11 @@ def suggest_solver(
     # Any path serves to inspect the terms.
     given_terms = with_paths_for_shapes(terms, WeakBrownianPath)
     terms = without_constraint(given_terms)
-    drift, noise = _drift_and_noise(terms)
+    _check_noise(terms)
     check_state("suggest_solver", y0)
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
+    terms = with_programs(terms, t0, y0, args)
+    drift, noise = split_terms(terms)
     check_terms_fit_state(terms, t0, y0, args)
     check_drifts_differ(terms)
     check_baths_have_own_noise(terms)
@@ -382,22 +385,20 @@ def _has_variables_for(
     return solver.variables == ("W",) or issubclass(increment, solver.minimal_levy_area)
 
 
-def _drift_and_noise(terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
-    """The drift terms and the noise terms. Raises a `ValueError` if there is no noise, or
-    a noise has no Brownian path."""
+def _check_noise(terms: diffrax.AbstractTerm) -> None:
+    """Raises a `ValueError` if there is no noise, or a noise has no Brownian path."""
     advice = (
         "Pass the terms of a Stratonovich system, `hamiltonian_terms(H0, noise, path)` or "
         "`MultiTerm(ODETerm(f), ControlTerm(g, path))`, with a Brownian path"
     )
     if not isinstance(terms, diffrax.AbstractTerm):
         raise ValueError(f"{advice}; got {type(terms).__name__}.")
-    drift, noise = split_terms(terms)
+    _, noise = split_terms(terms)
     if len(noise) == 0 or any(len(brownian_paths(term)) == 0 for term in noise):
         raise ValueError(
             f"{advice}; got terms without one. (For a system without noise use "
             "`ImplicitMidpoint` or `StormerVerlet`.)"
         )
-    return drift, noise
 
 
 def accepts_friction(

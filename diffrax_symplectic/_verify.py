@@ -30,11 +30,14 @@ from ._terms import (
     step_variables,
     Surface,
     to_spinors,
+    with_programs,
 )
 
 
 def _one_step(terms, solver, t0, t1, y0, args) -> tuple[Y, diffrax.RESULTS]:
     """The end of one step, and whether it succeeded."""
+    terms = with_programs(terms, t0, y0, args)
+    solver = with_programs(solver, t0, y0, args)
     # `diffrax.diffeqsolve` is not used: its loop takes longer to trace than the step.
     solver_state = solver.init(terms, t0, t1, y0, args)
     y1, _, _, _, result = solver.step(
@@ -106,7 +109,7 @@ def _allowed_directions(terms, t0, y0: Y, args: Args) -> Float[Array, "n k"]:
     """An orthonormal basis, in columns, of the directions along which a state can move that
     satisfies constraint(q) = 0 and J v = 0, with the Jacobian J of the constraint and the
     velocities v."""
-    surface = Surface.of(terms, t0, y0, args)
+    surface = Surface.of(with_programs(terms, t0, y0, args), t0, y0, args)
     flat, _ = jfu.ravel_pytree(y0)
 
     def equations(x: Array) -> Array:
@@ -239,7 +242,7 @@ def equipartition(
         check_pair(y)
         p, q = y
         # (-dH0/dq, dH0/dp)
-        force, velocity = rate(drift, t, y, args)
+        force, velocity = rate(with_programs(drift, t, y, args), t, y, args)
         n = sum(leaf.size for leaf in jtu.tree_leaves(q))
         return {
             "kinetic": _inner_product(p, velocity) / n,
@@ -413,7 +416,9 @@ def weak_order_defect(
     check_unconstrained(terms, "weak_order_defect")
     mean = step_expectation(terms, solver, t0, t1, y0, args, fn=fn, nodes=nodes)
     generator = _generator(
-        terms, args, ito=isinstance(solver, diffrax.AbstractItoSolver)
+        with_programs(terms, t0, y0, args),
+        args,
+        ito=isinstance(solver, diffrax.AbstractItoSolver),
     )
 
     def phi(t: RealScalarLike, y: Y) -> PyTree[Array]:

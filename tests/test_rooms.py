@@ -13,7 +13,8 @@ import diffrax_symplectic as ds
 ROOT = Path(ds.__file__).parent
 # From the bottom up. Those in a row do not import each other.
 FLOORS = [
-    ("_citation", "_compat", "_custom_types", "_products", "_signature"),
+    ("_citation", "_compat", "_custom_types", "_products"),
+    ("_programs",),
     ("_arguments", "_batch", "_lapack", "_stablehlo"),
     ("_brownian", "_root_finder"),
     ("_tableau",),

@@ -12,8 +12,9 @@ import jax.tree_util as jtu
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 
-from .._compat import is_closure_mismatch, quickly_compiled
+from .._compat import is_closure_mismatch
 from .._lapack import lapack_in_turn
+from .._programs import compiled
 from .sampling import Averaged, Samples
 
 
@@ -109,9 +110,9 @@ def _moments_on_devices(
         raise
 
 
-batch_moments = eqx.filter_jit(_moments_on_devices)
+batch_moments = compiled(_moments_on_devices)
 # The same for samples that take less time than compiling their program.
-quick_batch_moments = quickly_compiled(_moments_on_devices)
+quick_batch_moments = compiled(_moments_on_devices, quickly=True)
 
 
 def _moments_on_device(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from .._compat import dce_jaxpr, Jaxpr, programs_in
 from .._custom_types import Y
 from .._lapack import LAPACK
-from .._signature import once_for_each_signature
+from .._programs import once_for_each_signature
 from .._simulation import Problem
 from .._solver import without_newton
 

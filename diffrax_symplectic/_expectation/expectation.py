@@ -193,7 +193,9 @@ def expectation(
 
     has_shape = any(isinstance(path, UnspecifiedPath) for path in brownian_paths(terms))
     request = Request(not has_shape, key, sampling, tol, start, engine, devices)
-    problem_of = ft.partial(Problem.of, phi, terms, solver, t0, t1, dt0, y0, args, ts)
+    problem_of = ft.partial(
+        Problem.of, phi, terms, solver, t0, t1, dt0, y0, args, ts, key=key
+    )
     with Meter(progress_meter) as meter:
         while True:
             try:

@@ -7,8 +7,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from .._compat import quickly_compiled
 from .._custom_types import Y
+from .._programs import compiled
 from .._simulation import Problem
 from .fields_in_time import all_fields, at_both_states, depends_on_time, Field
 
@@ -88,4 +88,4 @@ def _departure(
     return jnp.where(is_small, 0, jnp.sqrt(departure / change))
 
 
-_quick_departure = quickly_compiled(_departure)
+_quick_departure = compiled(_departure, quickly=True)

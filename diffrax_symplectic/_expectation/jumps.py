@@ -10,8 +10,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from .._compat import quickly_compiled
 from .._custom_types import Y
+from .._programs import compiled
 from .._simulation import Problem
 from .._solver import (
     AbstractLangevinSplitting,
@@ -295,5 +295,5 @@ def _jumps(
     return lax.map(jumps_there, (times, is_last), batch_size=_STEPS_AT_ONCE)
 
 
-_quick_search = quickly_compiled(_search)
-_quick_jumps = quickly_compiled(_jumps)
+_quick_search = compiled(_search, quickly=True)
+_quick_jumps = compiled(_jumps, quickly=True)

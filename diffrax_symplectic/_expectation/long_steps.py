@@ -14,8 +14,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
 from .._brownian import zeros_and_unravel
-from .._compat import quickly_compiled, unwrapped
+from .._compat import unwrapped
 from .._custom_types import Terms
+from .._programs import compiled
 from .._simulation import Problem
 from .._solver import AbstractSymplecticSolver
 from .._terms import (
@@ -352,7 +353,7 @@ def _largest_growth(
     return lax.fori_loop(0, 2 * iterations, after_map, start)
 
 
-_quick_growth = quickly_compiled(_growth)
-_quick_frequencies = quickly_compiled(_frequencies)
-_quick_noise_frequency = quickly_compiled(_noise_frequency)
-_quick_short_step_succeeds = quickly_compiled(_short_step_succeeds)
+_quick_growth = compiled(_growth, quickly=True)
+_quick_frequencies = compiled(_frequencies, quickly=True)
+_quick_noise_frequency = compiled(_noise_frequency, quickly=True)
+_quick_short_step_succeeds = compiled(_short_step_succeeds, quickly=True)

@@ -12,8 +12,9 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
-from .._arguments import check_real, check_takes, whole_number
+from .._arguments import check_real, check_takes, check_untraced, whole_number
 from .._compat import is_result
+from .._programs import current_traces, Traced, traced
 from .._root_finder import all_finite
 from .._simulation import advice_on_failures, combinations, level_weights
 from .call import checked_call
@@ -113,8 +114,16 @@ def monte_carlo(
         raise ValueError(f"`order` must be a positive integer, or 1/2; got {order!r}.")
     sampling = IndependentPaths(num_paths, batch_size)
     weights = level_weights(float(order or 1), levels)
+    # A level is a Python integer, by which a function may choose its step, so each level is
+    # a program of its own.
+    with current_traces(fn):
+        programs = [
+            traced(ft.partial(_value_and_success, fn, level), key, identity=fn)
+            for level in ([()] if levels == 1 else [(k,) for k in range(levels)])
+        ]
+    check_untraced("`monte_carlo`", programs)
     plan = sampling.plan(
-        jtu.Partial(_samples_of_function, fn, weights), levels, devices
+        jtu.Partial(_samples_of_programs, programs, weights), levels, devices
     )
     with Meter(progress_meter) as meter:
         estimate = run(plan, key, devices, sampling, start, first, tol, meter)
@@ -124,21 +133,14 @@ def monte_carlo(
     return estimate
 
 
-def _samples_of_function(
-    fn: Callable,
+def _samples_of_programs(
+    programs: list[Traced],
     weights: Float[Array | np.ndarray, "combinations levels"],
     keys: Key[Array, " n"],
 ) -> Samples:
-    """A sample is a value of the function, with the same random key on all levels."""
-    _, levels = weights.shape
-
-    # A level is a Python integer, by which a function may choose its step, so each level is
-    # a call of its own.
-    values_and_success = []
-    for level in range(levels):
-        arguments = () if levels == 1 else (level,)
-        value_and_success_of = ft.partial(_value_and_success, fn, arguments)
-        values_and_success.append(jax.vmap(value_and_success_of)(keys))
+    """A sample is a value of the function, with the same random key on all levels, for each
+    of which there is a program."""
+    values_and_success = [jax.vmap(program)(keys) for program in programs]
     # (levels, n, ...) and (levels, n)
     values, success = jtu.tree_map(lambda *xs: jnp.stack(xs), *values_and_success)
 

@@ -11,8 +11,9 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from .._compat import quickly_compiled, unwrapped
+from .._compat import unwrapped
 from .._custom_types import Terms
+from .._programs import compiled
 from .._simulation import Problem
 from .._solver import (
     AbstractLangevinSplitting,
@@ -296,6 +297,6 @@ def _changing_most(derivative: _Linear, like: Float[Array, " n"]) -> Float[Array
     return lax.fori_loop(0, _ITERATIONS, iterate, start / jnp.linalg.norm(start))
 
 
-_quick_rates = quickly_compiled(_rates)
-_quick_change = quickly_compiled(_change_along_step)
-_quick_decay = quickly_compiled(_decay)
+_quick_rates = compiled(_rates, quickly=True)
+_quick_change = compiled(_change_along_step, quickly=True)
+_quick_decay = compiled(_decay, quickly=True)

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
@@ -25,7 +24,7 @@ from .._brownian import (
     typed_key,
 )
 from .._custom_types import Args, RealScalarLike, Y
-from .._signature import once_for_each_signature
+from .._programs import once_for_each_signature, Traced, traced
 from .._solver import own_path
 from .._terms import (
     brownian_paths,
@@ -233,32 +232,25 @@ def is_multiple(time: float, cell: float) -> bool:
 
 
 @once_for_each_signature
-def check_shapes(
-    phi: Callable,
-    terms: PyTree,
-    t0: Float[np.ndarray, ""],
-    y0: Y,
-    args: Args,
-) -> None:
-    """Raises an error unless the terms fit the state, and `phi` takes this state and
-    returns real arrays."""
+def check_fit(terms: PyTree, t0: Float[np.ndarray, ""], y0: Y, args: Args) -> None:
+    """Raises an error unless the terms fit the state."""
     check_terms_fit_state(terms, t0, y0, args)
-    check_takes("phi", phi, "t", "y", "args")
-    result = _result_struct(phi, terms, t0, y0, args)
-    check_real("phi", jtu.tree_leaves(result))
 
 
-def _result_struct(
+def traced_phi(
     phi: Callable, terms: PyTree, t0: Float[np.ndarray, ""], y0: Y, args: Args
-) -> PyTree[jax.ShapeDtypeStruct]:
-    """The shapes and dtypes of the arrays that `phi` returns. For spins and complex
-    amplitudes, errors explain which state `phi` gets."""
+) -> Traced:
+    """The program of `phi`. Raises an error unless it takes this state and returns real
+    arrays. For spins and complex amplitudes, errors explain which state `phi` gets."""
+    check_takes("phi", phi, "t", "y", "args")
 
     def result(t: RealScalarLike, y: Y, args: Args) -> PyTree[Array]:
-        return call_user_function("phi", phi, t, y, args=args)
+        values = call_user_function("phi", phi, t, y, args=args)
+        check_real("phi", jtu.tree_leaves(values))
+        return values
 
     try:
-        return eqx.filter_eval_shape(result, t0, y0, args)
+        return traced(result, t0, y0, args, identity=phi)
     except (TypeError, AttributeError, IndexError) as error:
         # A user who takes the pair for a spin `s` writes `s.x`, `s[2]` or `-s`.
         if has_lifted(terms):

@@ -26,6 +26,7 @@ from .._fused import (
     without_rescue,
 )
 from .._lapack import lapack_in_turn
+from .._programs import compiled
 from .._stablehlo import NotReplayed, source_lines
 from .levels import Level
 from .loop import values_of_paths
@@ -100,7 +101,7 @@ def _sample_keys(key: PRNGKeyArray, high: _Words, low: _Words) -> Array:
     return jax.vmap(ft.partial(sample_key, key))(high, low)
 
 
-@eqx.filter_jit
+@compiled
 def _draw_starts(
     problem: Problem, key: PRNGKeyArray, high: _Words, low: _Words
 ) -> tuple[PyTree, PyTree]:
@@ -108,7 +109,7 @@ def _draw_starts(
     return jax.vmap(problem.draw_start)(_sample_keys(key, high, low))
 
 
-@eqx.filter_jit
+@compiled
 @lapack_in_turn
 def _paths_by_jax(
     problem: Problem, key: PRNGKeyArray, high: _Words, low: _Words

@@ -19,10 +19,11 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from .._arguments import check_solver, check_state, whole_number
+from .._arguments import check_solver, check_state, check_untraced, whole_number
 from .._brownian import has_bounded_increments
 from .._compat import is_traced
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
+from .._programs import traced
 from .._root_finder import all_finite
 from .._solver import AbstractSymplecticSolver, check_resolution, own_path, Want
 from .._terms import (
@@ -38,18 +39,20 @@ from .._terms import (
     which_are_shapes,
     which_need_truncation,
     with_paths_for_shapes,
+    with_programs,
     without_truncation,
 )
 from .arguments import (
     check_cells,
     check_finite,
+    check_fit,
     check_noise,
-    check_shapes,
     check_truncation,
     drawn_args,
     drawn_state,
     given_state,
     step_numbers,
+    traced_phi,
 )
 from .levels import combinations, Level, level_weights, levels_of
 
@@ -115,10 +118,11 @@ class Problem(eqx.Module):
         levels: int,
         want: Want = "weak",
         caller: str = "expectation",
+        key: PRNGKeyArray | None = None,
     ) -> "Problem":
         """The problem of these arguments of `caller`, with a path of the solver in place of
-        each shape in `terms`. `want` is the purpose of these paths. Raises a `ValueError`
-        for bad arguments."""
+        each shape in `terms`. `want` is the purpose of these paths, and `key` a key of the
+        generator that draws starts. Raises a `ValueError` for bad arguments."""
         levels = whole_number("levels", levels)
         check_solver("solver", solver)
         if isinstance(solver, diffrax.HalfSolver):
@@ -134,11 +138,18 @@ class Problem(eqx.Module):
         # Where `args` or `y0` is drawn, an example takes its place. Any draw has the
         # structure of all: these keys serve as well as others.
         args_of = args if callable(args) else None
+        key = jr.key(0) if key is None else key
         if args_of is not None:
-            args = drawn_args(args_of, jr.key(0))
+            args = drawn_args(args_of, key)
+            args_of = traced(ft.partial(drawn_args, args_of), key, identity=args_of)
+        else:
+            # Other numbers compile nothing anew.
+            args = jtu.tree_map(_number_as_array, args)
         y0_of = y0 if callable(y0) else None
         if y0_of is not None:
-            y0 = drawn_state(y0_of, jr.key(1), args)
+            y0 = drawn_state(y0_of, key, args)
+            draw = ft.partial(drawn_state, y0_of)
+            y0_of = traced(draw, key, args, identity=y0_of)
         else:
             y0 = given_state(y0)
         check_state(caller, y0)
@@ -147,7 +158,12 @@ class Problem(eqx.Module):
 
         # Times have the dtype of the state.
         t0_of_dtype = np.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
-        check_shapes(phi, terms, t0_of_dtype, y0, args)
+        phi = traced_phi(phi, terms, t0_of_dtype, y0, args)
+        terms = with_programs(terms, t0_of_dtype, y0, args)
+        solver = with_programs(solver, t0_of_dtype, y0, args)
+        # What a function closes over shows in its program.
+        check_untraced(f"`{caller}`", (phi, terms, solver, y0_of, args_of))
+        check_fit(terms, t0_of_dtype, y0, args)
         # Here the values of `y0` are known. In the program of a solve they are not.
         check_assertions(terms, t0_of_dtype, y0, args)
         if constraint_of(terms) is not None:
@@ -207,11 +223,11 @@ class Problem(eqx.Module):
         y0_key, args_key = jr.split(jr.fold_in(key, _START_KEY))
         own_args = None
         if self.args_of is not None:
-            own_args = eqx.filter(drawn_args(self.args_of, args_key), eqx.is_array)
+            own_args = eqx.filter(self.args_of(args_key), eqx.is_array)
         if self.y0_of is None:
             return DrawnStart(self.y0, own_args)
         args = self.with_args(own_args).args
-        return DrawnStart(drawn_state(self.y0_of, y0_key, args), own_args)
+        return DrawnStart(self.y0_of(y0_key, args), own_args)
 
     def with_args(self, own_args: PyTree[Array]) -> "Problem":
         """The problem of a path with these arrays in its `args`, as in `DrawnStart`."""
@@ -342,6 +358,11 @@ def _order_of(solver: diffrax.AbstractSolver, terms: PyTree) -> int | float:
     """The weak order of a solver. Solvers of other packages have no `weak_order`, and
     solvers of the user may not state theirs: it counts as 1."""
     return getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
+
+
+def _number_as_array(x: Any) -> Any:
+    """A number of Python as an array. Integers are kept: they may be exponents or sizes."""
+    return jnp.asarray(x) if type(x) is float else x
 
 
 def _truncated_where_needed(

@@ -13,6 +13,7 @@ What solvers and expectations ask of terms, from the bottom up:
 
 - `paths`: the Brownian paths that terms hold.
 - `dependence`: which inputs the results of a function depend on.
+- `callers`: programs in place of the user's functions.
 - `evaluation`: calls of the user's functions, with advice on their errors.
 - `constrained_drift`: the drift of a system with a constraint.
 - `drift_and_noise`: which terms are drifts, and which are noises.
@@ -23,6 +24,7 @@ What solvers and expectations ask of terms, from the bottom up:
   with it; a folder.
 """
 
+from .callers import with_programs
 from .constrained_drift import check_unconstrained, constraint_of
 from .constrained_drift import with_constraint, without_constraint
 from .constraint import check_start, constrained_state, NormalSpace, Surface

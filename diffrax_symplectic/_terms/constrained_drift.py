@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._arguments import check_takes
 from .._custom_types import Args
+from .callers import AbstractCaller
 
 
 _T = TypeVar("_T")
@@ -22,7 +23,7 @@ KEEP = (
 )
 
 
-class ConstrainedDrift(diffrax.AbstractTerm):
+class ConstrainedDrift(diffrax.AbstractTerm, AbstractCaller):
     """The drift of Hamiltonians for positions with `constraint(q, args) = 0`.
 
     Its vector field depends on multipliers that a solver has to find. So the product with
@@ -35,6 +36,10 @@ class ConstrainedDrift(diffrax.AbstractTerm):
 
     def __check_init__(self):
         check_takes("constraint", self.constraint, "q", "args")
+
+    def called_with(self, t, y, args):
+        _, q = y
+        return {"constraint": (q, args)}
 
     def vf(self, t, y, args) -> PyTree[Array]:
         # Diffrax looks at the structure of the vector field before any solve, so the error

@@ -11,6 +11,7 @@ from jaxtyping import Array, PyTree
 
 from .._arguments import shapes
 from .._custom_types import Args
+from .._programs import note_call
 
 
 # Errors of a function that needs the values of its arguments while JAX traces it.
@@ -30,6 +31,7 @@ def call_user_function(
     # The function gets a copy: if it modifies `args` in place, each trace still has the
     # same ones.
     copy = jtu.tree_map(lambda leaf: leaf, args)
+    note_call(function, *inputs, copy)
     try:
         return function(*inputs, copy)
     except _NEED_VALUES as error:

@@ -6,16 +6,18 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
 from .._arguments import check_takes, checked_not_negative
+from .callers import AbstractCaller
 from .hamiltonian import hamiltonian_terms
 from .symplectic_gradients import IndexedNoise
 
 
-class Lifted(eqx.Module):
+class Lifted(AbstractCaller):
     """A Hamiltonian in another variable, `H(t, chart(p, q), args)`.
 
     A Module and not a closure, so that parameters within `H` stay leaves of the terms, and
@@ -24,6 +26,13 @@ class Lifted(eqx.Module):
 
     H: Callable
     chart: Callable[[tuple[PyTree, PyTree]], PyTree]
+    # Whether it is the function of an `IndexedNoise`, which takes the index first.
+    is_indexed: bool = eqx.field(static=True, default=False)
+
+    def called_with(self, t, y, args):
+        index = jax.ShapeDtypeStruct((), jnp.int32)
+        inputs = t, jax.eval_shape(self.chart, y), args
+        return {"H": (index, *inputs) if self.is_indexed else inputs}
 
     def __call__(self, *inputs) -> PyTree[Array]:
         # The first inputs are the time, or from an `IndexedNoise` the index and the time.
@@ -60,7 +69,7 @@ def lifted_terms(
     elif isinstance(noise, IndexedNoise):
         # The noise can still be evaluated one at a time, for the solvers that follow the
         # flow of one noise after another.
-        lifted_noise = IndexedNoise(Lifted(noise.H, chart), noise.m)
+        lifted_noise = IndexedNoise(Lifted(noise.H, chart, is_indexed=True), noise.m)
     else:
         check_takes("noise", noise, "t", variable_name, "args")
         lifted_noise = Lifted(noise, chart)

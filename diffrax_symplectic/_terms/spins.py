@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from .._arguments import check_pair
 from .._custom_types import Args, RealScalarLike
+from .callers import AbstractCaller
 from .evaluation import call_user_function, checked_energy
 from .lifted import checked_damping, damping_for, lifted_terms
 
@@ -87,12 +88,15 @@ def spin_terms(
 _EACH = "each spin"
 
 
-class _DampedPrecession(eqx.Module):
+class _DampedPrecession(AbstractCaller):
     """The velocity of the pair `(p, q)` for `ds/dt = s x omega` with `omega = grad H0 +
     alpha s x grad H0`."""
 
     H0: _SpinHamiltonian
     alpha: ArrayLike = eqx.field(converter=ft.partial(checked_damping, _EACH))
+
+    def called_with(self, t, y, args):
+        return {"H0": (t, jax.eval_shape(from_spinors, y), args)}
 
     def __call__(self, t: RealScalarLike, y: _Spinors, args: Args) -> _Spinors:
         s = from_spinors(y)

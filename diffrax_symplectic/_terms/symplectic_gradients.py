@@ -18,6 +18,7 @@ from .._arguments import check_pair, shapes, whole_number
 from .._brownian import increment_struct
 from .._compat import wrapped_like, ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike, Terms
+from .callers import AbstractCaller
 from .dependence import Dependence
 from .drift_and_noise import field_of
 from .evaluation import call_user_function, check_real_energies, checked_energy
@@ -36,7 +37,7 @@ Hamiltonian = Callable[[RealScalarLike, Momenta, Momenta, Args], PyTree[Array]]
 AssertedStructure = Literal["separable", "additive"]
 
 
-class IndexedNoise(eqx.Module):
+class IndexedNoise(AbstractCaller):
     r"""Noise Hamiltonians that can be evaluated one at a time, for
     [`diffrax_symplectic.hamiltonian_terms`][].
 
@@ -54,6 +55,9 @@ class IndexedNoise(eqx.Module):
             raise ValueError(
                 f"`H` must be a function `H(k, t, p, q, args)`; got {self.H!r}."
             )
+
+    def called_with(self, t, y, args):
+        return {"H": (jax.ShapeDtypeStruct((), jnp.int32), t, *y, args)}
 
     def one(
         self, k: IntScalarLike, t: RealScalarLike, p: PyTree, q: PyTree, args: Args
@@ -89,7 +93,7 @@ class OneNoise(eqx.Module):
     increment: RealScalarLike
 
 
-class Drift(eqx.Module):
+class Drift(AbstractCaller):
     """The vector field `(-dH0/dq, dH0/dp)`, where `slow` is a part of `H0`."""
 
     H0: Hamiltonian
@@ -97,6 +101,10 @@ class Drift(eqx.Module):
     # The user's function call that took `structure`, for messages.
     made_by: str = eqx.field(static=True, default="hamiltonian_terms")
     slow: Callable | None = None
+
+    def called_with(self, t, y, args):
+        p, q = y
+        return {"H0": (t, p, q, args), "slow": (t, q, args)}
 
     def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
         check_pair(y)
@@ -148,7 +156,7 @@ def slow_apart(drift: Terms) -> tuple[Terms, Terms]:
     return tuple(rest), tuple(slow)
 
 
-class AbstractNoise(diffrax.AbstractTerm):
+class AbstractNoise(diffrax.AbstractTerm, AbstractCaller):
     """Noise with a Brownian path. Subclasses define `vf`, for each array of the state with
     a trailing axis of noises, and `vf_prod`, which costs less."""
 
@@ -169,6 +177,12 @@ class HamiltonianNoise(AbstractNoise):
     noise: Hamiltonian
     path: diffrax.AbstractBrownianPath
     structure: AssertedStructure | None = eqx.field(static=True, default=None)
+
+    def called_with(self, t, y, args):
+        # An `IndexedNoise` is not the user's function, but calls one.
+        if isinstance(self.noise, IndexedNoise):
+            return {}
+        return {"noise": (t, *y, args)}
 
     def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
         # Diffrax's own solvers ask for this if they take several stages with one field.

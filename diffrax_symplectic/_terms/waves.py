@@ -13,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 
 from .._arguments import check_pair, shapes
 from .._custom_types import Args, RealScalarLike
+from .callers import AbstractCaller
 from .evaluation import call_user_function, checked_energy
 from .lifted import checked_damping, damping_for, lifted_terms
 
@@ -103,12 +104,15 @@ def wave_terms(
 _EACH = "each vector of amplitudes"
 
 
-class _DampedWaves(eqx.Module):
+class _DampedWaves(AbstractCaller):
     """The velocity of the pair `(p, q)` for `dpsi/dt = -i g + alpha (psi g^+ psi - g psi^+
     psi)` with `g = dH0/dpsi^*`."""
 
     H0: _WaveHamiltonian
     alpha: ArrayLike = eqx.field(converter=ft.partial(checked_damping, _EACH))
+
+    def called_with(self, t, y, args):
+        return {"H0": (t, jax.eval_shape(from_pair, y), args)}
 
     def __call__(self, t: RealScalarLike, y: _Pair, args: Args) -> _Pair:
         check_pair(y)

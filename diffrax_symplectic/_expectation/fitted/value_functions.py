@@ -6,6 +6,7 @@ $u$. For the exact $u$ the sum of these differences is $\\phi(y_N)$ minus its me
 """
 
 import dataclasses
+import functools as ft
 import warnings
 from typing import Any, NamedTuple
 
@@ -17,9 +18,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from ..._arguments import check_untraced, whole_number
-from ..._compat import quickly_compiled
 from ..._custom_types import Devices
 from ..._lapack import lapack_in_turn
+from ..._programs import compiled
 from ..._simulation import Combination, Problem
 from ..._solver import without_newton
 from ..estimate import combined_results, Expectation, total
@@ -345,7 +346,7 @@ def _fits_and_failures(
     return functions, num_failed
 
 
-@quickly_compiled
+@ft.partial(compiled, quickly=True)
 @lapack_in_turn
 def _fit_of_level(
     problem: Problem, index: Int[Array, "1"], key: PRNGKeyArray, basis: AbstractBasis

@@ -23,6 +23,7 @@ from ..._brownian import (
     THREE_POINT,
 )
 from ..._custom_types import Y
+from ..._programs import traced
 from ..._simulation import (
     combinations,
     independent_motion,
@@ -126,7 +127,8 @@ class ArrayRQMC(AbstractSampling):
             )
         sort_by = _state_itself if self.sort_by is None else self.sort_by
         check_takes("sort_by", sort_by, "y")
-        coordinates = eqx.filter_eval_shape(sort_by, problem.y0)
+        sort_by = traced(sort_by, problem.y0)
+        coordinates = jax.eval_shape(sort_by, problem.y0)
         check_real("sort_by", jtu.tree_leaves(coordinates))
         num_coordinates = jax.eval_shape(lambda: real_vector(sort_by(problem.y0))).size
         points = jnp.asarray(sobol_points(self.num_paths, layout.num_words))

@@ -16,6 +16,7 @@ from ..._arguments import check_pair, check_state
 from ..._batch import refused_where
 from ..._compat import is_traced
 from ..._custom_types import Args, RealScalarLike
+from ..callers import with_programs
 from ..constrained_drift import constraint_of, without_constraint
 from ..dependence import Dependence
 from ..langevin import split_friction
@@ -144,6 +145,7 @@ def constrained_state(
     check_pair(y0)
     check_state("constrained_state", y0)
     t = jnp.zeros((), jnp.result_type(*jtu.tree_leaves(y0)))
+    terms = with_programs(terms, t, y0, args)
     drift, _, _ = split_friction(without_constraint(terms))
     check_terms_fit_state(diffrax.MultiTerm(*drift), t, y0, args)
     if fault := separable_fault(drift, (), t, y0, args):

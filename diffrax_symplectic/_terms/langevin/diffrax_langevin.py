@@ -72,6 +72,9 @@ class _PrefixFriction(AbstractFriction):
 
     gamma: PyTree[ArrayLike]
 
+    def called_with(self, t, y, args):
+        return {}
+
     def velocity(self, t, y, args):
         del t, args
         v, _ = y

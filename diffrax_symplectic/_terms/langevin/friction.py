@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 from ..._arguments import check_takes, checked_not_negative, shapes
 from ..._compat import is_traced
 from ..._custom_types import Args, BM, RealScalarLike
+from ..callers import AbstractCaller
 from ..evaluation import call_user_function
 
 
@@ -28,7 +29,7 @@ Value = (
 _EXPECTED = "a real number, an array or PyTree of them, or a function of `(t, q, args)`"
 
 
-class FrictionAlong(eqx.Module):
+class FrictionAlong(AbstractCaller):
     r"""Friction along given directions, for [`diffrax_symplectic.langevin_terms`][]:
     $G = \sum_k d_k d_k^\top$.
 
@@ -38,6 +39,10 @@ class FrictionAlong(eqx.Module):
     """
 
     directions: Value
+
+    def called_with(self, t, y, args):
+        _, q = y
+        return {"directions": (t, q, args)}
 
 
 FrictionAlong.__init__.__doc__ = """**Arguments:**

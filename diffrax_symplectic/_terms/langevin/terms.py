@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -16,6 +15,7 @@ from ..._arguments import check_pair, check_takes
 from ..._brownian import increment_struct, TruncatedBrownianPath, zeros_and_unravel
 from ..._compat import wrapped_like, ω
 from ..._custom_types import Args, BM, RealScalarLike, Terms
+from ..callers import AbstractCaller
 from ..constrained_drift import Constraint, with_constraint
 from ..drift_and_noise import field_of, split_terms
 from ..evaluation import call_user_function, checked_energy
@@ -187,7 +187,7 @@ def friction_apart(drift: Terms) -> tuple[Terms, Terms]:
     return tuple(rest), tuple(friction)
 
 
-class AbstractFriction(eqx.Module):
+class AbstractFriction(AbstractCaller):
     """A vector field `(-G v, 0)` with the velocities `v`."""
 
     @abc.abstractmethod
@@ -218,6 +218,10 @@ class Friction(AbstractFriction):
     H0: _Hamiltonian
     friction: Any
 
+    def called_with(self, t, y, args):
+        p, q = y
+        return {"H0": (t, p, q, args), "friction": (t, q, args)}
+
     def velocity(self, t, y, args):
         p, q = y
 
@@ -230,12 +234,16 @@ class Friction(AbstractFriction):
         return (-(product_with(self.friction, t, q, args, velocity) ** ω)).ω
 
 
-class DriftWithFriction(eqx.Module):
+class DriftWithFriction(AbstractCaller):
     """A vector field with friction on its velocities `dq`, in one term: the solvers of
     Diffrax for stochastic equations take one drift and one noise."""
 
     drift: Callable
     friction: AbstractFriction
+
+    def called_with(self, t, y, args):
+        # Both parts are callers, too.
+        return {}
 
     def __call__(self, t: RealScalarLike, y: tuple[_Momenta, _Momenta], args: Args):
         _, q = y
@@ -250,6 +258,10 @@ class BathNoise(AbstractNoise):
     friction: Any
     temperature: Value
     path: diffrax.AbstractBrownianPath
+
+    def called_with(self, t, y, args):
+        _, q = y
+        return {"friction": (t, q, args), "temperature": (t, q, args)}
 
     def vf(
         self, t: RealScalarLike, y: tuple[_Momenta, _Momenta], args: Args

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from diffrax_symplectic._signature import once_for_each_signature
+from diffrax_symplectic._programs import once_for_each_signature
 
 
 def counted():

@@ -1,0 +1,466 @@
+"""Programs, found by what they compute.
+
+JAX finds a program by the function that it was traced from, as an object. So a function
+that reads a global keeps its value of the first call, and a new function of the same text
+compiles anew. Here the user's functions are traced in each call of this package, and equal
+traces are one object. To trace a Hamiltonian takes a millisecond, to compile an expectation
+takes seconds.
+
+- `traced`: the user's function as a `Traced`, by which JAX finds the programs that call it.
+- `compiled`: `equinox.filter_jit`, which keeps a limited number of programs.
+- `once_for_each_signature`: for functions that read no values of arrays.
+- `current_traces`: for functions that call `diffrax.diffeqsolve` themselves.
+- `digest`: what tells one computation from another, also in other processes.
+"""
+
+import collections
+import contextlib
+import contextvars
+import functools as ft
+import hashlib
+import itertools
+import re
+import threading
+import types
+import weakref
+from collections.abc import Callable, Hashable, Iterator, Mapping
+from typing import Any, NamedTuple, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, PyTree
+
+from ._compat import (
+    ClosedJaxpr,
+    evaluated,
+    is_program,
+    is_rule,
+    Jaxpr,
+    JaxprEqn,
+    Literal,
+    quick_options,
+    with_constants_for,
+    with_traces_of,
+)
+
+
+# The most programs that are kept, each of up to 30 MB. A call of `expectation` needs up to
+# ten. What is dropped is compiled again when it is needed again.
+_MOST_PROGRAMS = 128
+# The most calls that are compared. Functions that are made anew in each trace would add to
+# them without end.
+_MOST_CALLS = 64
+# The most results that a function remembers. Each holds a signature.
+_MOST_REMEMBERED = 128
+# Numbers in the text of a function are data, so that others compile nothing, unless they
+# have at most this many binary digits: those like 2, 1/2 and 12 belong to formulas, and XLA
+# simplifies what is made with them.
+_DIGITS_OF_FORMULAS = 2
+# Operations whose second argument XLA should know: it multiplies by the inverse of a
+# divisor, and makes products and roots of powers.
+_KNOWN_SECOND = frozenset(["div", "pow", "rem"])
+
+Result = TypeVar("Result")
+
+
+class Traced(eqx.Module):
+    """The user's function, as the program that it was when it was traced.
+
+    - `program`: all of it but the values of arrays. Functions that compute the same have
+        one and the same program.
+    - `numbers`: the arrays that the function closes over, and numbers in its text.
+    """
+
+    program: "_Program" = eqx.field(static=True)
+    numbers: list[Array]
+
+    def __call__(self, *inputs: PyTree) -> PyTree:
+        """The value of the function. The inputs have the structure and shapes of those for
+        which it was traced. What is no array in them is not read again."""
+        return self.program.value(self.numbers, inputs)
+
+
+def traced(fn: Callable, *inputs: PyTree, identity: Any = None) -> Traced:
+    """The function as a program of inputs like these: arrays or their shapes, and what else
+    it takes, which is then part of the program. A `Traced` is returned as it is.
+
+    What a trace only names, such as the rule of a custom derivative, is taken for the same
+    where `identity` is: the user's function, if `fn` calls it."""
+    if isinstance(fn, Traced):
+        return fn
+    leaves, treedef = jtu.tree_flatten(inputs)
+    is_array = [_is_array_or_struct(leaf) for leaf in leaves]
+    static_results = None
+
+    # JAX keeps traces by the identity of functions, too: this one is new in each call.
+    def results(*arrays: Array) -> PyTree[Array]:
+        nonlocal static_results
+        remaining = iter(arrays)
+        whole = [next(remaining) if is_it else x for is_it, x in zip(is_array, leaves)]
+        dynamic, static_results = eqx.partition(
+            fn(*treedef.unflatten(whole)), eqx.is_array_like
+        )
+        return dynamic
+
+    arrays = [x for is_it, x in zip(is_array, leaves) if is_it]
+    closed, struct = jax.make_jaxpr(results, return_shape=True)(*arrays)
+    jaxpr, numbers = _numbers_apart(closed.jaxpr)
+    program = _Program(jaxpr, is_array, jtu.tree_structure(struct), static_results)
+    numbers = [*map(jnp.asarray, closed.consts), *numbers]
+    return Traced(_interned(program, fn if identity is None else identity), numbers)
+
+
+def _is_array_or_struct(x: Any) -> bool:
+    return eqx.is_array(x) or isinstance(x, jax.ShapeDtypeStruct)
+
+
+class _Program:
+    """A function of arrays, hashed by identity.
+
+    - `jaxpr`: its program. Its constants are the `numbers` of a `Traced`.
+    - `is_array`: which leaves of its inputs are arrays.
+    - `treedef`, `static`: the structure of the arrays that it returns, and what else.
+    - `text`: a hash of what it computes, the same in all processes; set by `_interned`.
+    """
+
+    def __init__(
+        self, jaxpr: Jaxpr, is_array: list[bool], treedef: Any, static: PyTree
+    ):
+        self.jaxpr = jaxpr
+        self.is_array = is_array
+        self.treedef = treedef
+        self.static = static
+        self.text = ""
+
+    def __repr__(self) -> str:
+        return self.text
+
+    def value(self, numbers: list[Array], inputs: PyTree) -> PyTree:
+        leaves = jtu.tree_leaves(inputs)
+        arrays = [x for x, is_it in zip(leaves, self.is_array, strict=True) if is_it]
+        # Times may be numbers of Python.
+        arrays = [_converted(x, v.aval) for x, v in zip(arrays, self.jaxpr.invars)]
+        results = evaluated(self.jaxpr, numbers, arrays)
+        return eqx.combine(self.treedef.unflatten(results), self.static)
+
+
+def _converted(x: Any, aval: Any) -> Array:
+    has_dtype = eqx.is_array(x) and x.dtype == aval.dtype
+    return x if has_dtype else jnp.asarray(x, aval.dtype)
+
+
+def _numbers_apart(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:
+    """The program with constants for numbers in its text, and these numbers."""
+    places = [
+        (k, place)
+        for k, eqn in enumerate(jaxpr.eqns)
+        for place, x in enumerate(eqn.invars)
+        if isinstance(x, Literal) and _is_data(eqn, place, x)
+    ]
+    numbers = [jaxpr.eqns[k].invars[place] for k, place in places]
+    arrays = [jnp.asarray(x.val, x.aval.dtype) for x in numbers]  # pyright: ignore
+    return with_constants_for(jaxpr, places), arrays
+
+
+def _is_data(eqn: JaxprEqn, place: int, number: Literal) -> bool:
+    """Whether a number in the text of a function is data, rather than part of a formula."""
+    if place == 1 and eqn.primitive.name in _KNOWN_SECOND:
+        return False
+    value = np.asarray(number.val)
+    if not np.issubdtype(value.dtype, np.floating) or not np.isfinite(value):
+        return False
+    mantissa, _ = np.frexp(value.astype(float))
+    scaled = float(mantissa) * 2**_DIGITS_OF_FORMULAS
+    return scaled != round(scaled)
+
+
+# From what a program computes to the program, for as long as anything uses it.
+_known: weakref.WeakValueDictionary[Hashable, _Program] = weakref.WeakValueDictionary()
+_lock = threading.Lock()
+
+
+def _interned(program: _Program, identity: Any) -> _Program:
+    """The program that was known before, if one computes the same. `identity` is as for
+    `traced`."""
+    rules: list[Any] = []
+    described = (
+        _described(program.jaxpr, rules),
+        tuple(program.is_array),
+        program.treedef,
+        static_part(program.static),
+    )
+    # What a custom derivative or a callback computes is named in a trace, not written out.
+    # Then only the same function has the same program.
+    key = described, static_part(identity) if rules else None
+    with _lock:
+        known = _known.setdefault(key, program)
+    if not known.text:
+        known.text = _hash(_without_addresses(repr(described)))
+    return known
+
+
+def _described(jaxpr: Jaxpr, rules: list[Any]) -> Hashable:
+    """All that a program computes. Appends to `rules` what is not described, but named."""
+    number_of: dict[Any, int] = {}
+    # Most operations have the same context, whose text is long.
+    contexts: dict[int, str] = {}
+
+    def variable(x: Any) -> Hashable:
+        if isinstance(x, Literal):
+            return _type_of(x.aval), np.asarray(x.val).tobytes()
+        return number_of.setdefault(x, len(number_of))
+
+    inputs = [
+        (variable(x), _type_of(x.aval)) for x in (*jaxpr.constvars, *jaxpr.invars)
+    ]
+    operations = []
+    for eqn in jaxpr.eqns:
+        context = contexts.setdefault(id(eqn.ctx), str(eqn.ctx))
+        operands = tuple(map(variable, eqn.invars))
+        results = tuple(map(variable, eqn.outvars))
+        params = _described_value(eqn.params, rules)
+        operations.append((eqn.primitive, context, operands, params, results))
+    outputs = tuple(map(variable, jaxpr.outvars))
+    return tuple(inputs), tuple(operations), outputs
+
+
+def _type_of(aval: Any) -> Hashable:
+    return aval.shape, str(aval.dtype), getattr(aval, "weak_type", False)
+
+
+def _described_value(x: Any, rules: list[Any]) -> Hashable:
+    """A parameter of an operation."""
+    if is_program(x):
+        # The arrays that a program within the function closes over are part of it.
+        consts = x.consts if isinstance(x, ClosedJaxpr) else ()
+        values = tuple(_described_value(const, rules) for const in consts)
+        return values, _described(getattr(x, "jaxpr", x), rules)
+    if isinstance(x, Mapping):
+        return tuple((name, _described_value(x[name], rules)) for name in sorted(x))
+    if isinstance(x, tuple | list):
+        return type(x), tuple(_described_value(item, rules) for item in x)
+    if eqx.is_array(x):
+        return _array_value(x)
+    if isinstance(x, float | complex):
+        # Zeros of both signs are equal, and NaN is not equal to itself.
+        return type(x), repr(x)
+    if is_rule(x) or not _is_hashable(x):
+        rules.append(x)
+        return type(x)
+    return type(x), x
+
+
+def _array_value(x: Array | np.ndarray) -> Hashable:
+    """The values of an array, with its shape and dtype."""
+    is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    words = jax.random.key_data(x) if is_key else x
+    return x.shape, str(x.dtype), np.asarray(words).tobytes()
+
+
+def _is_hashable(x: Any) -> bool:
+    try:
+        hash(x)
+    except TypeError:
+        return False
+    return True
+
+
+class _Same:
+    """Compares what cannot be hashed by identity."""
+
+    def __init__(self, x: Any):
+        self._x = x
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, _Same) and self._x is other._x
+
+    def __hash__(self) -> int:
+        return id(self._x)
+
+
+def static_part(tree: PyTree) -> Hashable:
+    """A PyTree without the values of its arrays: their shapes and dtypes, and all else."""
+    leaves, treedef = jtu.tree_flatten(tree)
+    if not _is_hashable(treedef):
+        return _Same(tree)
+    return treedef, tuple(map(_static_leaf, leaves))
+
+
+def _static_leaf(leaf: Any) -> Hashable:
+    if eqx.is_array(leaf):
+        # Traces tell JAX's arrays of weak types from others.
+        return leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)
+    if isinstance(leaf, types.MethodType) and not _is_hashable(leaf):
+        return _Same(leaf.__self__), leaf.__func__
+    # `1`, `1.0` and `True` are equal, but not the same input.
+    return type(leaf), leaf if _is_hashable(leaf) else _Same(leaf)
+
+
+class _Remembered:
+    """Values by their keys, of which those used last are kept."""
+
+    def __init__(self, most: int):
+        self._most = most
+        self._values: collections.OrderedDict[Hashable, Any] = collections.OrderedDict()
+        self._lock = threading.Lock()
+
+    def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
+        """The value of this key, from `make` if it is not there."""
+        with self._lock:
+            if key in self._values:
+                self._values.move_to_end(key)
+                return self._values[key]
+        # If this raises an error, nothing is remembered.
+        value = make()
+        self.put(key, value)
+        return value
+
+    def put(self, key: Hashable, value: Any) -> None:
+        with self._lock:
+            self._values[key] = value
+            self._values.move_to_end(key)
+            if len(self._values) > self._most:
+                self._values.popitem(last=False)
+
+
+_programs = _Remembered(_MOST_PROGRAMS)
+
+
+def compiled(fn: Callable[..., Result], quickly: bool = False) -> Callable[..., Result]:
+    """`equinox.filter_jit(fn)` for functions that return arrays. Programs are dropped when
+    many others were used since; JAX would keep them all.
+
+    With `quickly` they are compiled by XLA's older generator of code for CPUs, where this
+    version of XLA has it. The program of a fit takes 2.6 to 5 s of processor time to
+    compile by the newer generator, and 1.8 to 3.2 s by the older one. Both programs run at
+    the same speed."""
+
+    @ft.wraps(fn)
+    def call(*args: Any) -> Result:
+        leaves, treedef = jtu.tree_flatten(args)
+        is_array = [eqx.is_array(leaf) for leaf in leaves]
+        static = [None if is_it else leaf for is_it, leaf in zip(is_array, leaves)]
+
+        def of_arrays(arrays: list[Array]) -> Result:
+            remaining = iter(arrays)
+            whole = [
+                next(remaining) if is_it else x for is_it, x in zip(is_array, static)
+            ]
+            return fn(*treedef.unflatten(whole))
+
+        def jitted() -> Callable:
+            # Equinox hands on options to `jax.jit`, which its types do not say.
+            options: Any = dict(compiler_options=quick_options()) if quickly else {}
+            return eqx.filter_jit(of_arrays, **options)
+
+        key = fn, quickly, treedef, tuple(is_array), static_part(static)
+        arrays = [x for is_it, x in zip(is_array, leaves) if is_it]
+        try:
+            return _programs.get(key, jitted)(arrays)
+        except ValueError as error:
+            # JAX refuses options for a program inside of another, or one that captures
+            # values of another, before it calls `fn`. It has no class of errors for this.
+            if "`compiler_options`" not in str(error):
+                raise
+        return of_arrays(arrays)
+
+    return call
+
+
+# The user's functions that are called while a trace is made, with their inputs.
+_calls: contextvars.ContextVar[dict[Hashable, tuple[Any, ...]] | None]
+_calls = contextvars.ContextVar("calls", default=None)
+_numbers_of_traces = itertools.count(1)
+
+
+def note_call(fn: Callable, *inputs: PyTree) -> None:
+    """Tells `current_traces` of a call of a function of the user, before the call."""
+    calls = _calls.get()
+    if calls is not None:
+        structs = jtu.tree_map(_struct_of_array, inputs)
+        calls.setdefault((_Same(fn), static_part(inputs)), (fn, *structs))
+
+
+def _struct_of_array(x: Any) -> Any:
+    return jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x
+
+
+class _Watched(NamedTuple):
+    """A trace that JAX may use again.
+
+    - `number`: that of its `with_traces_of`.
+    - `calls`: the functions and inputs of the calls in it, and their programs.
+    """
+
+    number: int
+    calls: list[tuple[tuple[Any, ...], Traced]]
+
+    def is_current(self) -> bool:
+        """Whether all functions still compute the same."""
+        if len(self.calls) > _MOST_CALLS:
+            return False
+        return all(
+            digest(traced(*call)) == digest(program) for call, program in self.calls
+        )
+
+
+_watched = _Remembered(_MOST_REMEMBERED)
+
+
+@contextlib.contextmanager
+def current_traces(fn: Callable) -> Iterator[None]:
+    """A context in which to trace a function of the user that solves equations. JAX keeps
+    traces of `diffrax.diffeqsolve` by the identity of the functions in its terms: they are
+    used again while these functions compute the same, since they take a second to make."""
+    key = static_part(fn)
+    known = _watched.get(key, lambda: None)
+    if known is None or not known.is_current():
+        known = _Watched(next(_numbers_of_traces), [])
+    calls: dict[Hashable, tuple[Any, ...]] = {}
+    token = _calls.set(calls)
+    try:
+        with with_traces_of(known.number):
+            yield
+    finally:
+        _calls.reset(token)
+    new_calls = []
+    for call in calls.values():
+        try:
+            new_calls.append((call, traced(*call)))
+        except jax.errors.UnexpectedTracerError:
+            # Made within `fn`, from values of this trace: the next trace has another.
+            continue
+    _watched.put(key, _Watched(known.number, [*known.calls, *new_calls]))
+
+
+def once_for_each_signature(fn: Callable[..., Result]) -> Callable[..., Result]:
+    """A function that reads no values of arrays in its arguments, and is called once for
+    each structure, shapes and dtypes of these. Tracing anew takes longer than a short
+    ensemble: the checks of shapes took 5 of 11 ms for 64 paths."""
+    remembered = _Remembered(_MOST_REMEMBERED)
+
+    @ft.wraps(fn)
+    def call_once(*args: Any) -> Result:
+        settings = jax.default_backend(), jnp.result_type(float)
+        return remembered.get((static_part(args), settings), lambda: fn(*args))
+
+    return call_once
+
+
+def digest(tree: PyTree) -> str:
+    """A hash of all values in a PyTree, the same in all processes with the same versions of
+    packages. Functions that were not traced count by their names."""
+    leaves, treedef = jtu.tree_flatten(tree)
+    values = [_array_value(x) if eqx.is_array(x) else repr(x) for x in leaves]
+    return _hash(_without_addresses(repr((treedef, values))))
+
+
+def _without_addresses(text: str) -> str:
+    return re.sub(r" at 0x[0-9a-f]+", "", text)
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
