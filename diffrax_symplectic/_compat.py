@@ -169,17 +169,18 @@ def is_program(x: Any) -> bool:
 
 def is_rule(x: Any) -> bool:
     """Whether this parameter of an operation is a function, such as the rule of a custom
-    derivative, or a callback. JAX wraps some of these in objects that are not callable."""
-    return callable(x) and not isinstance(x, type) or hasattr(x, "call_wrapped")
+    derivative, or a callback. JAX wraps some of these in objects that are not callable, and
+    a mesh of devices is."""
+    if isinstance(x, type | jax.sharding.Mesh):
+        return False
+    return callable(x) or hasattr(x, "call_wrapped")
 
 
 def with_constants_for(jaxpr: Jaxpr, places: Sequence[tuple[int, int]]) -> Jaxpr:
     """A program with new constants, after those that it has, in these places: each is the
     number of an operation and that of its argument."""
-    structs = [
-        jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype)
-        for x in (jaxpr.eqns[k].invars[place] for k, place in places)
-    ]
+    avals: list[Any] = [jaxpr.eqns[k].invars[place].aval for k, place in places]
+    structs = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
     # Versions of JAX construct variables from different arguments: here it does so itself.
     new_constants = jax.make_jaxpr(lambda *xs: xs)(*structs).jaxpr.invars
     eqns = list(jaxpr.eqns)

@@ -71,7 +71,7 @@ class Traced(eqx.Module):
 
     - `program`: all of it but the values of arrays. Functions that compute the same have
         one and the same program.
-    - `numbers`: the arrays that the function closes over, and numbers in its text.
+    - `numbers`: the arrays that the function closes over or holds, and numbers in its text.
     """
 
     program: "_Program" = eqx.field(static=True)
@@ -91,7 +91,7 @@ def traced(fn: Callable, *inputs: PyTree, identity: Any = None) -> Traced:
     where `identity` is: the user's function, if `fn` calls it."""
     if isinstance(fn, Traced):
         return fn
-    leaves, treedef = jtu.tree_flatten(inputs)
+    leaves, treedef = jtu.tree_flatten((fn, inputs))
     is_array = [_is_array_or_struct(leaf) for leaf in leaves]
     static_results = None
 
@@ -100,16 +100,19 @@ def traced(fn: Callable, *inputs: PyTree, identity: Any = None) -> Traced:
         nonlocal static_results
         remaining = iter(arrays)
         whole = [next(remaining) if is_it else x for is_it, x in zip(is_array, leaves)]
-        dynamic, static_results = eqx.partition(
-            fn(*treedef.unflatten(whole)), eqx.is_array_like
-        )
+        of_arrays, inputs = treedef.unflatten(whole)
+        result = of_arrays(*inputs)
+        dynamic, static_results = eqx.partition(result, eqx.is_array_like)
         return dynamic
 
     arrays = [x for is_it, x in zip(is_array, leaves) if is_it]
     closed, struct = jax.make_jaxpr(results, return_shape=True)(*arrays)
     jaxpr, numbers = _numbers_apart(closed.jaxpr)
-    program = _Program(jaxpr, is_array, jtu.tree_structure(struct), static_results)
-    numbers = [*map(jnp.asarray, closed.consts), *numbers]
+    # The function comes first. It may be a Module, or a `jax.tree_util.Partial`.
+    own_arrays = [leaf for leaf in jtu.tree_leaves(fn) if eqx.is_array(leaf)]
+    is_input = is_array[len(jtu.tree_leaves(fn)) :]
+    program = _Program(jaxpr, is_input, jtu.tree_structure(struct), static_results)
+    numbers = [*map(jnp.asarray, closed.consts), *numbers, *own_arrays]
     return Traced(_interned(program, fn if identity is None else identity), numbers)
 
 
@@ -120,8 +123,9 @@ def _is_array_or_struct(x: Any) -> bool:
 class _Program:
     """A function of arrays, hashed by identity.
 
-    - `jaxpr`: its program. Its constants are the `numbers` of a `Traced`.
-    - `is_array`: which leaves of its inputs are arrays.
+    - `jaxpr`: its program. The constants and the first inputs are the `numbers` of a
+        `Traced`.
+    - `is_array`: which leaves of the inputs of the function are arrays.
     - `treedef`, `static`: the structure of the arrays that it returns, and what else.
     - `text`: a hash of what it computes, the same in all processes; set by `_interned`.
     """
@@ -141,9 +145,14 @@ class _Program:
     def value(self, numbers: list[Array], inputs: PyTree) -> PyTree:
         leaves = jtu.tree_leaves(inputs)
         arrays = [x for x, is_it in zip(leaves, self.is_array, strict=True) if is_it]
+        num_consts = len(self.jaxpr.constvars)
+        arrays = [*numbers[num_consts:], *arrays]
         # Times may be numbers of Python.
-        arrays = [_converted(x, v.aval) for x, v in zip(arrays, self.jaxpr.invars)]
-        results = evaluated(self.jaxpr, numbers, arrays)
+        arrays = [
+            _converted(x, variable.aval)
+            for x, variable in zip(arrays, self.jaxpr.invars, strict=True)
+        ]
+        results = evaluated(self.jaxpr, numbers[:num_consts], arrays)
         return eqx.combine(self.treedef.unflatten(results), self.static)
 
 
@@ -237,7 +246,8 @@ def _described_value(x: Any, rules: list[Any]) -> Hashable:
         # The arrays that a program within the function closes over are part of it.
         consts = x.consts if isinstance(x, ClosedJaxpr) else ()
         values = tuple(_described_value(const, rules) for const in consts)
-        return values, _described(getattr(x, "jaxpr", x), rules)
+        jaxpr: Any = x.jaxpr if isinstance(x, ClosedJaxpr) else x
+        return values, _described(jaxpr, rules)
     if isinstance(x, Mapping):
         return tuple((name, _described_value(x[name], rules)) for name in sorted(x))
     if isinstance(x, tuple | list):
@@ -330,8 +340,8 @@ _programs = _Remembered(_MOST_PROGRAMS)
 
 
 def compiled(fn: Callable[..., Result], quickly: bool = False) -> Callable[..., Result]:
-    """`equinox.filter_jit(fn)` for functions that return arrays. Programs are dropped when
-    many others were used since; JAX would keep them all.
+    """`equinox.filter_jit(fn)` for functions that return arrays, which drops programs when
+    many others were used since.
 
     With `quickly` they are compiled by XLA's older generator of code for CPUs, where this
     version of XLA has it. The program of a fit takes 2.6 to 5 s of processor time to
@@ -352,9 +362,10 @@ def compiled(fn: Callable[..., Result], quickly: bool = False) -> Callable[..., 
             return fn(*treedef.unflatten(whole))
 
         def jitted() -> Callable:
-            # Equinox hands on options to `jax.jit`, which its types do not say.
-            options: Any = dict(compiler_options=quick_options()) if quickly else {}
-            return eqx.filter_jit(of_arrays, **options)
+            # What `equinox.filter_jit` compiled would not be freed with it.
+            return jax.jit(
+                of_arrays, compiler_options=quick_options() if quickly else {}
+            )
 
         key = fn, quickly, treedef, tuple(is_array), static_part(static)
         arrays = [x for is_it, x in zip(is_array, leaves) if is_it]

@@ -1,10 +1,230 @@
-"""Checks are made once for each signature of their arguments."""
+"""Programs are found by what functions compute, as they are when they are called."""
 
+import functools as ft
+import gc
+import os
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
 import jax.numpy as jnp
+import jax.tree_util as jtu
 import numpy as np
 import pytest
 
-from diffrax_symplectic._programs import once_for_each_signature
+from diffrax_symplectic import _programs
+from diffrax_symplectic._programs import (
+    compiled,
+    current_traces,
+    digest,
+    note_call,
+    once_for_each_signature,
+    traced,
+)
+
+
+ONE = jnp.array(1.0)
+strength = 1.0
+
+
+class Spring(eqx.Module):
+    """A function with an array of its own."""
+
+    k: jax.Array
+
+    def __call__(self, x):
+        return self.k * x**2
+
+    def energy(self, x):
+        return self(x) / 2
+
+
+class Counter:
+    """An object of Python that changes."""
+
+    def __init__(self):
+        self.k = 1.0
+
+    def energy(self, x):
+        return self.k * x
+
+
+def reads_global(x):
+    return strength * x
+
+
+def closes_over(k):
+    return lambda x: k * x
+
+
+def test_a_function_that_reads_a_global_is_what_it_is_now():
+    global strength
+    for strength in (1.0, 0.3, 7.0):
+        assert traced(reads_global, ONE)(2.0) == 2 * strength
+
+
+def test_a_bound_method_reads_the_attribute_as_it_is_now():
+    counter = Counter()
+    for counter.k in (1.0, 0.3, 7.0):
+        assert traced(counter.energy, ONE)(2.0) == 2 * counter.k
+
+
+@pytest.mark.parametrize(
+    "first, second",
+    [
+        (closes_over(jnp.array(2.0)), closes_over(jnp.array(3.0))),
+        (closes_over(np.float64(2.3)), closes_over(np.float64(3.1))),
+        (closes_over(2.3), closes_over(3.1)),
+        (Spring(jnp.array(2.0)), Spring(jnp.array(3.0))),
+        (Spring(jnp.array(2.0)).energy, Spring(jnp.array(3.0)).energy),
+        (jtu.Partial(jnp.multiply, ONE), jtu.Partial(jnp.multiply, 2 * ONE)),
+        (lambda x: jnp.where(x > 0.7, x, 0), lambda x: jnp.where(x > 0.3, x, 0)),
+    ],
+    ids="array numpy python module method partial comparison".split(),
+)
+def test_other_numbers_are_another_input_of_the_same_program(first, second):
+    one = traced(first, ONE)
+    other = traced(second, ONE)
+    assert one.program is other.program
+    for fn, program in ((first, one), (second, other)):
+        assert program(0.5) == fn(jnp.array(0.5))
+    assert digest(one) != digest(other)
+
+
+def with_rule(factor):
+    @jax.custom_jvp
+    def square(x):
+        return x**2
+
+    square.defjvp(lambda x, dx: (square(*x), factor * x[0] * dx[0]))
+    return square
+
+
+def with_callback(fn):
+    return lambda x: jax.pure_callback(fn, x, x)
+
+
+def with_jit(k):
+    return jax.jit(lambda x: k * x)
+
+
+@pytest.mark.parametrize(
+    "first, second",
+    [
+        (lambda x: x**2, lambda x: x**3),
+        (lambda x: x / 2, lambda x: x / 3),
+        (lambda x: -0.0 * x, lambda x: 0.0 * x),
+        (lambda x: 2 * x, lambda x: 2 + x),
+        (lambda x: x - 2 * ONE, lambda x: 2 * ONE - x),
+        (lambda x: (x, 1), lambda x: (x, 2)),
+        (lambda x: (x, "a"), lambda x: (x, "b")),
+        (with_rule(2.0), with_rule(3.0)),
+        (with_jit(2 * ONE), with_jit(3 * ONE)),
+        (with_callback(np.sin), with_callback(np.cos)),
+    ],
+)  # fmt: skip
+def test_functions_that_compute_something_else_are_other_programs(first, second):
+    one = traced(first, ONE)
+    other = traced(second, ONE)
+    assert one.program is not other.program
+    assert jtu.tree_leaves(one(0.5)) == jtu.tree_leaves(first(jnp.array(0.5)))
+    assert jtu.tree_leaves(other(0.5)) == jtu.tree_leaves(second(jnp.array(0.5)))
+
+
+def test_the_rules_of_custom_derivatives_are_those_of_the_same_function():
+    square = with_rule(5.0)
+    once = traced(square, ONE)
+    assert traced(square, ONE).program is once.program
+    assert jax.grad(once)(2.0) == 10
+
+
+def test_inputs_that_are_no_arrays_are_part_of_the_program():
+    power = lambda x, n: x**n
+    square = traced(power, ONE, 2)
+    cube = traced(power, ONE, 3)
+    assert (square(3.0, 2), cube(3.0, 3)) == (9, 27)
+    assert square.program is not cube.program
+
+
+def test_programs_work_under_transformations():
+    program = traced(Spring(jnp.array(3.0)), ONE)
+    xs = jnp.arange(3.0)
+    np.testing.assert_allclose(jax.vmap(program)(xs), 3 * xs**2)
+    np.testing.assert_allclose(jax.vmap(jax.grad(program))(xs), 6 * xs)
+    by_k = jax.grad(lambda k: traced(closes_over(k), ONE)(2.0))
+    assert by_k(jnp.array(1.0)) == 2
+
+
+def test_programs_are_dropped_with_all_that_uses_them():
+    before = len(_programs._known)
+    program = traced(lambda x: jnp.sinh(jnp.cosh(x)), ONE)
+    assert len(_programs._known) == before + 1
+    del program
+    gc.collect()
+    assert len(_programs._known) == before
+
+
+def test_the_number_of_compiled_programs_has_a_bound(monkeypatch):
+    few = _programs._Remembered(2)
+    monkeypatch.setattr(_programs, "_programs", few)
+    apply = compiled(lambda program, x: program(x))
+    client = jax.devices()[0].client
+
+    def run(k):
+        program = traced(lambda x: x**k, ONE)
+        assert apply(program, jnp.array(2.0)) == 2.0**k
+
+    run(20)
+    gc.collect()
+    before = len(client.live_executables())
+    for k in range(21, 29):
+        run(k)
+    gc.collect()
+    assert len(client.live_executables()) <= before + 1
+
+
+def test_a_hash_of_a_program_is_the_same_in_other_processes():
+    code = (
+        "import jax, jax.numpy as jnp; jax.config.update('jax_enable_x64', True)\n"
+        "from diffrax_symplectic._programs import digest, traced\n"
+        "x = jnp.ones(3)\n"
+        "fn = lambda x: {'a': jnp.sum(jnp.where(x > 0.3, jax.nn.relu(x), 0)), 'b': x @ x}\n"
+        "print(digest((traced(fn, x), fn, x, 'text')))"
+    )
+    found = set()
+    for seed in "12":
+        environment = os.environ | {"PYTHONHASHSEED": seed}
+        run = subprocess.run(
+            [sys.executable, "-c", code], capture_output=True, env=environment
+        )
+        assert run.returncode == 0, run.stderr.decode()
+        found.add(run.stdout)
+    assert len(found) == 1
+
+
+def test_traces_of_solves_are_used_again_while_their_functions_are_the_same():
+    """The user's functions are called within a `jit`, as by `diffrax.diffeqsolve`."""
+    global strength
+    num_calls = 0
+
+    @ft.partial(jax.jit, static_argnums=1)
+    def inner(x, fn):
+        nonlocal num_calls
+        num_calls += 1
+        note_call(fn, x)
+        return fn(x)
+
+    def outer(x):
+        return inner(x, reads_global)
+
+    found = []
+    for new in (1.0, 1.0, 0.3, 0.3):
+        strength = new
+        with current_traces(outer):
+            found.append(float(traced(outer, ONE)(2.0)))
+    assert found == [2, 2, 0.6, 0.6]
+    assert num_calls == 2
 
 
 def counted():

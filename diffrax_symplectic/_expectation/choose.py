@@ -119,7 +119,9 @@ def choose(problem_for: Callable[[Want], Problem], request: Request) -> Decision
     reason = "; ".join(filter(None, [why_sampling, why_law, plan.reason]))
     if start is not None:
         reason = start.reason
-    plan = plan._replace(reason=reason, rounding_floor=problem.finest_steps)
+    plan = plan._replace(
+        reason=reason, rounding_floor=problem.finest_steps, digests=problem.digests
+    )
     if start is not None and tol is None and plan.num_samples == _MOST_SAMPLES:
         # `start` had a tolerance, and this call has none: it takes no further samples.
         num_taken = start.moments[-1].end - start.moments[0].begin

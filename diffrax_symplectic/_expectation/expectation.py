@@ -113,8 +113,9 @@ def expectation(
     by the solver's weak order (1 if it states none). Three levels also check that order.
 
     This function runs outside JAX transformations: it cannot be differentiated, `jit`ted or
-    `vmap`ped. A new function `phi` or in `terms` compiles anew; for many parameters pass
-    them as arrays in `args`. For gradients, events and other options of `diffeqsolve`,
+    `vmap`ped. Each call traces the functions anew, so what they read is read anew, and
+    compiles only if they compute something else than before: other numbers and arrays do
+    not count. For gradients, events and other options of `diffeqsolve`,
     write a function of a key for [`diffrax_symplectic.monte_carlo`][].
 
     **Arguments:**
@@ -142,8 +143,8 @@ def expectation(
     - `tol`: the largest `error`. No further batch starts once every `error` is at most
         `tol`, or more samples would not reach it. The number of samples in `sampling` is
         then an upper limit. Parts to merge need a number of `levels` beside `tol`.
-    - `start`: an earlier estimate to continue. It must come from the same `key` and the
-        same arguments; only their shapes are checked.
+    - `start`: an earlier estimate to continue, from the same `key` and the same arguments:
+        others are refused.
     - `first`: the number of the first sample. Parts of an estimate that were computed
         separately, each with its own `first`, are combined by `Expectation.merge`: see
         [many machines](many_machines.md).

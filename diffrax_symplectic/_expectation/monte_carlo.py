@@ -1,6 +1,5 @@
 """Averages of any function of a random key."""
 
-import functools as ft
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,7 +13,7 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
 from .._arguments import check_real, check_takes, check_untraced, whole_number
 from .._compat import is_result
-from .._programs import current_traces, Traced, traced
+from .._programs import current_traces, digest, Traced, traced
 from .._root_finder import all_finite
 from .._simulation import advice_on_failures, combinations, level_weights
 from .call import checked_call
@@ -67,8 +66,9 @@ def monte_carlo(
         print(estimate.mean, estimate.std_error, estimate.num_failed)
         ```
 
-    A new `fn` compiles anew; `jax.tree_util.Partial(fn, parameter)` does not. To
-    differentiate, call `jax.grad` inside `fn` (on several devices with [these
+    `fn` is traced in each call, so what it reads is read anew. Another parameter in
+    `jax.tree_util.Partial(fn, parameter)` compiles nothing. To differentiate, call
+    `jax.grad` inside `fn` (on several devices with [these
     adjoints](adjoints.md#several-devices)). `monte_carlo` itself runs outside JAX
     transformations: it cannot be differentiated, `jit`ted or `vmap`ped.
 
@@ -118,13 +118,14 @@ def monte_carlo(
     # a program of its own.
     with current_traces(fn):
         programs = [
-            traced(ft.partial(_value_and_success, fn, level), key, identity=fn)
+            traced(jtu.Partial(_value_and_success, fn, level), key, identity=fn)
             for level in ([()] if levels == 1 else [(k,) for k in range(levels)])
         ]
     check_untraced("`monte_carlo`", programs)
     plan = sampling.plan(
         jtu.Partial(_samples_of_programs, programs, weights), levels, devices
     )
+    plan = plan._replace(digests=dict(fn=digest(programs), order=digest(order)))
     with Meter(progress_meter) as meter:
         estimate = run(plan, key, devices, sampling, start, first, tol, meter)
     advice = advice_on_failures(has_bounded_increments=False, is_implicit=False)

@@ -78,6 +78,7 @@ def run(
         sampling=sampling,
         reason=plan.reason,
         tails=plan.tails,
+        digests=plan.digests,
     )
     if start is not None:
         check_same(start, estimate, "`start`")

@@ -80,7 +80,7 @@ class SamplingPlan(NamedTuple):
         without a trace.
     - `is_quick`: whether the samples take less time than compiling their program, which is
         then compiled for speed of compilation.
-    - `tails`, `rounding_floor`: as in `Expectation`.
+    - `tails`, `rounding_floor`, `digests`: as in `Expectation`.
     - `simulate_paths`: for paths computed outside JAX, maps the number of the first sample
         and the number of samples to an argument that the sampler takes before the keys.
     """
@@ -97,6 +97,7 @@ class SamplingPlan(NamedTuple):
     is_quick: bool = False
     tails: PyTree[np.ndarray] | None = None
     rounding_floor: int = 1
+    digests: dict[str, str] | None = None
     simulate_paths: Callable[[int, int], Any] | None = None
 
 

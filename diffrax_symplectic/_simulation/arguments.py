@@ -237,20 +237,20 @@ def check_fit(terms: PyTree, t0: Float[np.ndarray, ""], y0: Y, args: Args) -> No
     check_terms_fit_state(terms, t0, y0, args)
 
 
+def _real_phi(phi: Callable, t: RealScalarLike, y: Y, args: Args) -> PyTree[Array]:
+    values = call_user_function("phi", phi, t, y, args=args)
+    check_real("phi", jtu.tree_leaves(values))
+    return values
+
+
 def traced_phi(
     phi: Callable, terms: PyTree, t0: Float[np.ndarray, ""], y0: Y, args: Args
 ) -> Traced:
     """The program of `phi`. Raises an error unless it takes this state and returns real
     arrays. For spins and complex amplitudes, errors explain which state `phi` gets."""
     check_takes("phi", phi, "t", "y", "args")
-
-    def result(t: RealScalarLike, y: Y, args: Args) -> PyTree[Array]:
-        values = call_user_function("phi", phi, t, y, args=args)
-        check_real("phi", jtu.tree_leaves(values))
-        return values
-
     try:
-        return traced(result, t0, y0, args, identity=phi)
+        return traced(jtu.Partial(_real_phi, phi), t0, y0, args, identity=phi)
     except (TypeError, AttributeError, IndexError) as error:
         # A user who takes the pair for a spin `s` writes `s.x`, `s[2]` or `-s`.
         if has_lifted(terms):

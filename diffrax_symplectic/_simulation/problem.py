@@ -23,7 +23,7 @@ from .._arguments import check_solver, check_state, check_untraced, whole_number
 from .._brownian import has_bounded_increments
 from .._compat import is_traced
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
-from .._programs import traced
+from .._programs import digest, traced
 from .._root_finder import all_finite
 from .._solver import AbstractSymplecticSolver, check_resolution, own_path, Want
 from .._terms import (
@@ -207,6 +207,28 @@ class Problem(eqx.Module):
         if is_traced(index):
             return jtu.tree_map(lambda x: jnp.asarray(x)[index], self.levels)
         return jtu.tree_map(lambda x: x[index], self.levels)
+
+    @property
+    def digests(self) -> dict[str, str]:
+        """What tells this problem from others, by the names of arguments."""
+        level = self.level(0)
+
+        def times(num_steps: Any) -> np.ndarray:
+            # In single precision: with other steps the same time is rounded otherwise.
+            return np.asarray(self.t0 + num_steps * level.h, np.float32)
+
+        arguments = dict(
+            phi=self.phi,
+            terms=self.terms,
+            solver=self.solver,
+            t0=self.t0,
+            t1=times(level.num_steps),
+            dt0=level.h,
+            y0=self.y0 if self.y0_of is None else self.y0_of,
+            args=self.args if self.args_of is None else self.args_of,
+            ts=times(level.saved_steps),
+        )
+        return {name: digest(value) for name, value in arguments.items()}
 
     @property
     def order(self) -> int | float:

@@ -34,6 +34,8 @@ class AbstractCaller(eqx.Module):
 # Parts that call functions, and are none that a user wrote.
 _PARTS = AbstractCaller, diffrax.AbstractTerm, diffrax.AbstractSolver
 _TERMS_OF_DIFFRAX = (
+    diffrax.ODETerm,
+    diffrax.ControlTerm,
     diffrax.MultiTerm,
     diffrax.UnderdampedLangevinDiffusionTerm,
     diffrax.UnderdampedLangevinDriftTerm,
@@ -51,7 +53,7 @@ def with_programs(terms: _T, t: RealScalarLike, y: Y, args: Args) -> _T:
     for part in _parts(terms):
         if isinstance(part, AbstractCaller):
             check_pair(y)
-        if _is_term_of_user(part):
+        elif isinstance(part, diffrax.AbstractTerm) and _is_of_user(part):
             programs[id(part)] = _TracedTerm.of(part, t, y, args)
         for name, inputs in _called_with(part, t, y, args).items():
             fn = getattr(part, name)
@@ -97,14 +99,15 @@ def _called_with(
 def _program(part: Any, name: str, inputs: tuple[Any, ...]) -> Callable:
     """The program of the function in this field of a part."""
     fn = getattr(part, name)
-
-    def call(*inputs: Any) -> PyTree[Array]:
-        *others, args = inputs
-        return call_user_function(name, fn, *others, args=args)
-
+    call = jtu.Partial(_call, name, fn)
     if isinstance(part, diffrax.ControlTerm):
         return _traced_field(call, *inputs, identity=fn)
     return traced(call, *inputs, identity=fn)
+
+
+def _call(name: str, fn: Callable, *inputs: Any) -> PyTree[Array]:
+    *others, args = inputs
+    return call_user_function(name, fn, *others, args=args)
 
 
 def _traced_field(
@@ -117,12 +120,15 @@ def _traced_field(
     struct = field.in_structure()
 
     # An operator may hold a function, which is no result of a program.
-    def product(t: RealScalarLike, y: Y, args: Args, control: PyTree[Array]) -> Y:
-        return fn(t, y, args).mv(control)
-
+    product = jtu.Partial(_product, fn)
     return _OperatorField(
         traced(product, t, y, args, struct, identity=identity), struct
     )
+
+
+def _product(fn: Callable, *inputs: Any) -> Y:
+    *state, control = inputs
+    return fn(*state).mv(control)
 
 
 class _OperatorField(eqx.Module):
@@ -173,6 +179,5 @@ class _TracedTerm(diffrax.AbstractTerm):
         return self.product(t, y, args, control)
 
 
-def _is_term_of_user(part: Any) -> bool:
-    known = AbstractCaller, diffrax.ODETerm, diffrax.ControlTerm, *_TERMS_OF_DIFFRAX
-    return isinstance(part, diffrax.AbstractTerm) and not isinstance(part, known)
+def _is_of_user(term: diffrax.AbstractTerm) -> bool:
+    return not isinstance(term, _TERMS_OF_DIFFRAX)

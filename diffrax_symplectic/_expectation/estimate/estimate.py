@@ -47,7 +47,7 @@ class Expectation(eqx.Module):
     - `key_data`: the data of the random key.
 
     The other fields are what `save` stores beside these, and may change: `moments`,
-    `paths_per_sample`, `rounding_floor` and `tails`.
+    `paths_per_sample`, `rounding_floor`, `tails` and `digests`.
     """
 
     # The moments of batches, with neighbours combined.
@@ -62,6 +62,8 @@ class Expectation(eqx.Module):
     # For value functions: the mean absolute deviation from the fitted mean in the tails, as
     # estimated by paths whose noise is wider or pushed to one side.
     tails: PyTree[np.ndarray] | None = None
+    # What tells this estimate from those of other arguments, by the names of these.
+    digests: dict[str, str] | None = None
 
     @property
     def levels(self) -> int:
@@ -231,7 +233,7 @@ class Expectation(eqx.Module):
         If the parts start at multiples of the batch size, the result is bitwise equal to a
         single estimate from all samples, for any order of merging.
 
-        **Raises:** a `ValueError` for parts with another key, of other shapes, by another
+        **Raises:** a `ValueError` for parts with other arguments or another key, by another
         `sampling`, or with samples in common.
 
         **Source:** [Chan, Golub and LeVeque
@@ -276,7 +278,8 @@ class Expectation(eqx.Module):
         """Reads an estimate written by `save`. No code from the file is executed.
 
         **Raises:** a `ValueError` for another file, and for a sampling that this version
-        does not have.
+        does not have. Warns of a file without the digests by which `merge` and `start=`
+        tell the arguments of estimates.
         """
         with np.load(file, allow_pickle=False) as arrays:
             if "header" not in arrays:
@@ -343,8 +346,16 @@ def combined_results(estimate: Expectation, combination: Combination) -> Results
 
 
 def check_same(one: Expectation, other: Expectation, name: str) -> None:
-    """Raises a `ValueError` if the estimates have different keys, shapes or numbers of
-    paths in a sample. `name` is what messages call one of them, such as "`start`"."""
+    """Raises a `ValueError` if the estimates come from different arguments, have different
+    keys or shapes, or numbers of paths in a sample. `name` is what messages call one of
+    them, such as "`start`"."""
+    different = _different_arguments(one.digests or {}, other.digests or {})
+    if different:
+        raise ValueError(
+            f"{name} was computed with another {' and another '.join(different)}. Parts of "
+            "an estimate have the same arguments. (A function is another one if it "
+            "computes something else, and with another version of JAX.)"
+        )
     if not np.array_equal(one.key_data, other.key_data):
         raise ValueError(
             f"{name} has another `key`. Pass the same `key` for all parts of an "
@@ -364,6 +375,15 @@ def check_same(one: Expectation, other: Expectation, name: str) -> None:
             f"{other.paths_per_sample:,} in the other. Pass the same `sampling` for all "
             "parts of an estimate."
         )
+
+
+def _different_arguments(one: dict[str, str], other: dict[str, str]) -> list[str]:
+    """The names of arguments that differ, among those that both estimates know."""
+    return [
+        f"`{name}`"
+        for name, value in one.items()
+        if name in other and other[name] != value
+    ]
 
 
 def _numbers(tree: PyTree[np.ndarray | np.floating] | None) -> list[float]:

@@ -1,6 +1,7 @@
 """Estimates in files: arrays, and their structure as JSON."""
 
 import dataclasses
+import warnings
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -44,7 +45,8 @@ def header_of(estimate: Any) -> dict[str, Any]:
         "fields": sampling_fields_as_json,
         "tails": estimate.tails is not None,
     }
-    return header | {name: getattr(estimate, name) for name in _FIELDS_OF_ESTIMATE}
+    header |= {name: getattr(estimate, name) for name in _FIELDS_OF_ESTIMATE}
+    return header | {"digests": estimate.digests}
 
 
 def arrays_of(estimate: Any) -> dict[str, np.ndarray]:
@@ -97,6 +99,14 @@ def fields_from(
 
     moments = [moments_of_batch(*of_batch) for of_batch in enumerate(header["ranges"])]
     fields = {name: header[name] for name in _FIELDS_OF_ESTIMATE}
+    # Files of earlier versions have none.
+    fields["digests"] = header.get("digests")
+    if fields["digests"] is None:
+        warnings.warn(
+            "This estimate was saved without digests of its arguments: `merge` and "
+            "`start=` cannot check that others have the same.",
+            stacklevel=3,
+        )
     return fields | {
         "moments": tuple(moments),
         "key_data": arrays["key_data"],
