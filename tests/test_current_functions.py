@@ -1,0 +1,265 @@
+"""Each call computes with the user's functions as they are at that time, on every way on
+which they come."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import jax.random as jr
+import jax.tree_util as jtu
+import lineax as lx
+import numpy as np
+import pytest
+
+import diffrax_symplectic as ds
+from diffrax_symplectic._simulation.problem import Problem
+from diffrax_symplectic._terms import (
+    brownian_paths,
+    rate,
+    replace_paths,
+    shapes_as_paths,
+    split_terms,
+)
+
+from .drjit_here import needs_drjit
+
+
+ONE = jnp.array(1.0)
+Y0 = (jnp.array([0.3, 0.1]), jnp.array([0.7, -0.2]))
+# What every function below reads.
+k = 1.0
+
+
+def H0(t, p, q, args):
+    return jnp.sum(p**2) / 2 + k * jnp.sum(q**2) / 2
+
+
+def free(t, p, q, args):
+    return jnp.sum(p**2) / 2
+
+
+def kick(t, p, q, args):
+    return -k * q
+
+
+def number(t, q, args):
+    return k
+
+
+def field(t, y, args):
+    p, q = y
+    return -k * q, p
+
+
+def operator(t, y, args):
+    p, q = y
+    struct = jax.eval_shape(lambda: p)
+    return lx.FunctionLinearOperator(lambda w: (k * w, 0 * q), struct)
+
+
+def of_spins(t, s, args):
+    return k * s[2]
+
+
+def of_waves(t, psi, args):
+    return k * jnp.sum(jnp.real(psi * jnp.conj(psi)))
+
+
+class TermOfUser(diffrax.AbstractTerm):
+    """A term of a class that this package does not know."""
+
+    def vf(self, t, y, args):
+        return field(t, y, args)
+
+    def contr(self, t0, t1, **kwargs):
+        return t1 - t0
+
+    def prod(self, vf, control):
+        return jtu.tree_map(lambda x: control * x, vf)
+
+
+def with_noise(drift):
+    noise = ds.hamiltonian_terms(free, lambda t, p, q, args: q, (2,)).terms[1]
+    return diffrax.MultiTerm(drift, noise)
+
+
+PATH = ds.WeakBrownianPath((2,), jr.key(0))
+ALONG = lambda t, q, args: k * jnp.ones((2, 1))
+# From what reads `k` to terms.
+TERMS = {
+    "H0": lambda: ds.hamiltonian_terms(H0, lambda t, p, q, args: q, (2,)),
+    "noise": lambda: ds.hamiltonian_terms(free, kick, (2,)),
+    "slow": lambda: ds.hamiltonian_terms(
+        free, kick, (2,), slow=lambda t, q, args: k * q[0]
+    ),
+    "indexed noise": lambda: ds.hamiltonian_terms(
+        free, ds.IndexedNoise(lambda i, t, p, q, args: k * q[i], 2), (2,)
+    ),
+    "friction": lambda: ds.langevin_terms(free, number, 1.0, (2,)),
+    "temperature": lambda: ds.langevin_terms(free, 1.0, number, (2,)),
+    "directions": lambda: ds.langevin_terms(free, ds.FrictionAlong(ALONG), 1.0, (1,)),
+    "energy of a bath": lambda: ds.langevin_terms(H0, 1.0, 1.0, (2,)),
+    "vector field": lambda: with_noise(diffrax.ODETerm(field)),
+    "operator": lambda: diffrax.MultiTerm(
+        diffrax.ODETerm(field), diffrax.ControlTerm(operator, PATH)
+    ),
+    "term of the user's": lambda: with_noise(TermOfUser()),
+    "spins": lambda: ds.spin_terms(of_spins, of_spins, ()),
+    "damped spins": lambda: ds.spin_terms(of_spins, of_spins, (), damping=0.3),
+    "waves": lambda: ds.wave_terms(of_waves, of_waves, ()),
+    "damped waves": lambda: ds.wave_terms(of_waves, of_waves, (), damping=0.3),
+    "noise of spins, indexed": lambda: ds.spin_terms(
+        of_spins, ds.IndexedNoise(lambda i, t, s, args: k * s[i], 3), (3,)
+    ),
+    "Diffrax's Langevin terms": lambda: diffrax.MultiTerm(
+        diffrax.UnderdampedLangevinDriftTerm(1.0, 1.0, lambda x, args: k * x),
+        diffrax.UnderdampedLangevinDiffusionTerm(1.0, 1.0, PATH),
+    ),
+}
+
+
+def problem_of(terms, solver=None, y0=Y0, phi=None, args=None):
+    phi = phi or (lambda t, y, args: y[1])
+    solver = solver or ds.ImplicitMidpoint()
+    return Problem.of(phi, terms, solver, 0, 1, 0.5, y0, args, None, 1)
+
+
+def changes(terms, y):
+    """The change of the state by each term."""
+    drift, noise = split_terms(terms)
+    unit = [jtu.tree_map(lambda x: 1 + 0 * x, term.contr(0.0, 0.1)) for term in noise]
+    kicks = [term.vf_prod(0.0, y, None, w) for term, w in zip(noise, unit)]
+    return jtu.tree_leaves((rate(drift, 0.0, y, None), kicks))
+
+
+def as_given(terms, problem):
+    """The terms that the user passed, with the paths of the problem."""
+    remaining = iter(brownian_paths(problem.terms))
+    return replace_paths(shapes_as_paths(terms), lambda path: next(remaining))
+
+
+@pytest.mark.parametrize("name", TERMS)
+def test_terms_are_those_of_now(name):
+    global k
+    terms = TERMS[name]()
+    y0 = Y0
+    if "spins" in name:
+        y0 = ds.to_spinors(jnp.array([0.6, 0.0, 0.8]))
+    found = []
+    for new in (1.0, 5.0):
+        k = new
+        problem = problem_of(terms, y0=y0)
+        found.append(changes(problem.terms, y0))
+        with jax.disable_jit():
+            expected = changes(as_given(terms, problem), y0)
+        for got, exact in zip(found[-1], expected, strict=True):
+            np.testing.assert_allclose(got, exact, atol=1e-12)
+    assert any(np.any(a != b) for a, b in zip(*found))
+
+
+def test_everything_else_is_that_of_now():
+    global k
+    terms = ds.hamiltonian_terms(free, kick, ())
+    y0_of = lambda key, args: (args, k * ONE)
+    args_of = lambda key: k * ONE
+    phi = lambda t, y, args: k * y[1]
+    flow = lambda time, y, args: (y[0], y[1] + k * time * y[0])
+    for k in (1.0, 5.0):
+        problem = problem_of(terms, ds.BAOAB(flow), y0_of, phi, args_of)
+        y0, args = problem.draw_start(jr.key(3))
+        assert (*y0, args) == (k, k, k)
+        assert problem.values(0.0, (ONE, 2 * ONE)) == 2 * k
+        assert problem.solver.flow(1.0, (ONE, ONE), ONE)[1] == 1 + k
+
+
+def position(t, y, args):
+    return y[1]
+
+
+def mean(**kwargs):
+    terms = ds.hamiltonian_terms(spring, lambda t, p, q, args: 0.0 * q, ())
+    return ds.expectation(
+        position, terms, ds.StormerVerlet(), 0, 1, 0.25, (0 * ONE, ONE),
+        key=jr.key(0), levels=1, **kwargs,
+    ).mean  # fmt: skip
+
+
+def spring(t, p, q, args):
+    return (p**2 + k * q**2) / 2
+
+
+def paths(engine):
+    terms = ds.hamiltonian_terms(spring, lambda t, p, q, args: 0.0 * q, ())
+    return ds.ensemble(
+        terms, ds.StormerVerlet(), 0, 1, 0.25, (0 * ONE, ONE),
+        key=jr.key(0), num_paths=2, engine=engine,
+    ).ys[1][0]  # fmt: skip
+
+
+def of_key(key):
+    terms = ds.hamiltonian_terms(
+        spring, lambda t, p, q, args: 0.0 * q, ds.WeakBrownianPath((), key)
+    )
+    sol = diffrax.diffeqsolve(terms, ds.StormerVerlet(), 0, 1, 0.25, (0 * ONE, ONE))
+    return sol.ys[1][-1]
+
+
+def step():
+    terms = ds.hamiltonian_terms(
+        spring, lambda t, p, q, args: 0.0 * q, ds.WeakBrownianPath((), jr.key(0))
+    )
+    call = terms, ds.StormerVerlet(), 0.0, 1.0, (0 * ONE, ONE)
+    return ds.step_expectation(*call, fn=position)
+
+
+def allowed():
+    rod = lambda q, args: jnp.stack([jnp.sum(q**2) - k])
+    terms = ds.hamiltonian_terms(free, constraint=rod)
+    _, q = ds.constrained_state(terms, Y0)
+    return jnp.sum(q**2)
+
+
+def sorted_by(y):
+    return k * y[1]
+
+
+CALLS = {
+    "IndependentPaths": lambda: mean(sampling=ds.IndependentPaths(2)),
+    "ArrayRQMC": lambda: mean(sampling=ds.ArrayRQMC(4, 2, sort_by=sorted_by)),
+    "ensemble": lambda: paths("jax"),
+    "ensemble, fused": lambda: paths("drjit"),
+    "monte_carlo": lambda: ds.monte_carlo(of_key, key=jr.key(0), num_paths=2).mean,
+    "step_expectation": step,
+}
+
+
+def verlet(h=0.25):
+    """The position that `StormerVerlet` reaches without noise."""
+    p, q = 0.0, 1.0
+    for _ in range(round(1 / h)):
+        p = p - h / 2 * k * q
+        q = q + h * p
+        p = p - h / 2 * k * q
+    return q
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=needs_drjit) if "fused" in name else name
+        for name in CALLS
+    ],
+)
+@pytest.mark.filterwarnings("ignore")
+def test_calls_compute_with_the_functions_of_now(name):
+    global k
+    for new in (1.0, 5.0):
+        k = new
+        exact = verlet(1.0) if name == "step_expectation" else verlet()
+        np.testing.assert_allclose(CALLS[name](), exact, rtol=1e-6)
+
+
+def test_allowed_states_are_those_of_the_constraint_of_now():
+    global k
+    for new in (1.0, 5.0):
+        k = new
+        np.testing.assert_allclose(allowed(), k)
