@@ -38,7 +38,7 @@ from .estimate import (
     needs_level,
 )
 from .fast_drive import unresolved_drive
-from .finer_level import changes_with_finer_level
+from .finer_level import trial_with_finer_level
 from .fused_paths import FusedPaths
 from .jumps import jumps_at_step_ends, jumps_within_steps
 from .kinks import has_kinks
@@ -231,7 +231,14 @@ def expectation(
     # Warnings of the problem come with its first samples, and not again with later parts.
     if start is None and first == 0:
         try:
-            messages = _messages_on_steps(estimate, problem, float(dt0), key, devices)
+            messages = _messages_on_steps(estimate, problem, float(dt0))
+            # A trial takes longer than these looks, which name the cause.
+            if estimate.levels == 2 and not messages:
+                trial = trial_with_finer_level(
+                    estimate, problem, used_sampling, key, devices
+                )
+                estimate = dataclasses.replace(estimate, caveat=trial.caveat)
+                messages += [] if trial.message is None else [trial.message]
             if has_kinks(problem):
                 messages += _messages_on_law(estimate, problem, key, devices)
         except ExpectationInterrupted:
@@ -244,32 +251,24 @@ def expectation(
 
 
 def _messages_on_steps(
-    estimate: Expectation,
-    problem: Problem,
-    dt0: float,
-    key: PRNGKeyArray,
-    devices: Devices,
+    estimate: Expectation, problem: Problem, dt0: float
 ) -> list[str]:
     """What is wrong with the steps, which the error of the estimate may not show."""
     # With one level the result does not claim to include the discretization error.
     if estimate.levels == 1:
         return []
-    told = [jumps_within_steps(problem) or unresolved_drive(problem)]
+    told = [
+        jumps_within_steps(problem) or unresolved_drive(problem),
+        too_long_steps(problem, dt0),
+    ]
     # With three levels the order is checked, which shows the following.
     if estimate.levels == 2:
         told += [
-            too_long_steps(problem, dt0),
             unresolved_noise(problem, dt0),
             unresolved_friction(problem, dt0),
             jumps_at_step_ends(problem),
         ]
-    messages = [message for message in told if message is not None]
-    # A trial takes longer than the looks above, which name the cause.
-    if estimate.levels == 2 and not messages:
-        change = changes_with_finer_level(estimate, problem, key, devices)
-        if change is not None:
-            messages.append(change)
-    return messages
+    return [message for message in told if message is not None]
 
 
 def _messages_on_law(

@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools as ft
+import warnings
 from typing import NamedTuple
 
 import jax.tree_util as jtu
@@ -12,6 +13,7 @@ from .._custom_types import Devices
 from .._simulation import (
     Combination,
     finer_change_weights,
+    halved,
     has_discrete_increments,
     is_multiple,
     Problem,
@@ -30,6 +32,7 @@ from .estimate import combined_results, Expectation
 from .fitted import ValueFunctions
 from .independent import IndependentPaths
 from .run import run
+from .sampling import AbstractSampling
 
 
 # The numbers of paths of a trial: more are taken only while their noise hides changes as
@@ -42,6 +45,9 @@ _PART_BEYOND_FIRST = 32
 # Fewer paths than this do not know their own spread, and more would take longer than the
 # estimate.
 _FEWEST_PATHS = 32
+# The same for a trial by the sampling of an estimate, where more samples are as good as a
+# smaller change.
+_PARTS_OF_SAME_SAMPLING = 8, 2
 # A change is sure if it is this many standard errors from zero: by chance that happens once
 # in 370 times for a single mean, and hardly more often for the largest of many.
 _SURE_OF_ONE = 3
@@ -49,83 +55,171 @@ _SURE_OF_ONE = 3
 _MOST_FAILED = 0.1
 
 
-def changes_with_finer_level(
-    estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: Devices
-) -> str | None:
-    """How a finer level changes an estimate by more than its error, as a sentence; `None`
-    if it does not.
+class Trial(NamedTuple):
+    """What a trial with a finer level tells.
+
+    - `message`: how it changes a mean by more than its error; `None` if it does not.
+    - `caveat`: which changes the trial could not see, in words; empty if these are less
+        than the error.
+    """
+
+    message: str | None = None
+    caveat: str = ""
+
+
+def trial_with_finer_level(
+    estimate: Expectation,
+    problem: Problem,
+    sampling: AbstractSampling,
+    key: PRNGKeyArray,
+    devices: Devices,
+) -> Trial:
+    """Whether a finer level changes an estimate of two levels by more than its error.
 
     Two levels are wrong and agree where both miss what happens in shorter times, such as a
-    close encounter or a decay, and by chance where phases are lost. The trial takes few
-    paths, each with the same noise on all levels where the solver allows it, so that their
-    differences vary little."""
+    rotation, a close encounter or a decay, and by chance where phases are lost.
+
+    A trial has to be about as accurate as the estimate. So paths with value functions are
+    taken again with half the steps, by the programs that are compiled already. Of other
+    samplings a trial has few paths, each with the same noise on all levels where the solver
+    allows it, so that their differences vary little; where these vary too much all the same
+    sorted paths are taken again, too."""
     if any(map(has_unknown_law, brownian_paths(problem.terms))):
-        return None
+        return Trial()
     key = trial_key(key)
+    arguments = estimate, problem, key, devices
+    changes = None
+    if not isinstance(sampling, ValueFunctions):
+        changes = _changes_on_same_noise(*arguments)
+    is_hidden = changes is None or not changes.are_sure and changes.are_hidden
+    if is_hidden and not isinstance(sampling, IndependentPaths):
+        changes = _changes_by_same_sampling(*arguments, sampling) or changes
+    if changes is None:
+        return Trial()
+    if changes.are_sure:
+        return Trial(message=_message(changes, float(problem.levels.h[-1]) / 2))
+    if changes.are_hidden:
+        return Trial(caveat=_caveat(changes))
+    return Trial()
+
+
+class _Changes(NamedTuple):
+    """The changes of all means by a finer level.
+
+    - `sizes`, `noise`: their sizes and standard errors.
+    - `errors`: the errors of the means.
+    - `num_paths`: the number of paths of the trial.
+    """
+
+    sizes: Float[np.ndarray, " n"]
+    noise: Float[np.ndarray, " n"]
+    errors: Float[np.ndarray, " n"]
+    num_paths: int
+
+    @property
+    def visible(self) -> Float[np.ndarray, " n"]:
+        """The smallest changes that are surely no noise."""
+        sure = np.sqrt(_SURE_OF_ONE**2 + 2 * np.log(self.sizes.size))
+        return sure * self.noise
+
+    @property
+    def excess(self) -> Float[np.ndarray, " n"]:
+        """By how much the changes surely exceed the errors."""
+        # What is not finite is larger than nothing.
+        return np.nan_to_num(self.sizes - self.visible - self.errors, nan=-np.inf)
+
+    @property
+    def are_sure(self) -> bool:
+        """Whether a change is surely more than an error."""
+        return bool(np.any(self.excess > 0))
+
+    @property
+    def are_hidden(self) -> bool:
+        """Whether the noise would hide a change as large as an error."""
+        return bool(np.any(self.visible > self.errors))
+
+
+def _message(changes: _Changes, h: float) -> str:
+    worst = np.argmax(changes.excess)
+    return (
+        f"Steps are too long: on {changes.num_paths} paths of a trial, a third level, with "
+        f"steps of {h:.3g}, changes a mean by {changes.sizes[worst]:.2g} ± "
+        f"{changes.noise[worst]:.1g}, which is more than its error, "
+        f"{changes.errors[worst]:.1g}. Pass a smaller `dt0`, or `tol`, which takes smaller "
+        "steps until they fit the order."
+    )
+
+
+def _caveat(changes: _Changes) -> str:
+    worst = np.argmax(changes.visible / changes.errors)
+    return (
+        f"a trial with half the steps, on {changes.num_paths:,} paths, would have shown an "
+        f"error of the step above {changes.visible[worst]:.1e} (see `levels`)"
+    )
+
+
+def _changes_on_same_noise(
+    estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: Devices
+) -> _Changes | None:
+    """The changes on independent paths, as many as they take; `None` if too few are
+    affordable, or too many fail."""
     finer_problem = _with_finer_level(problem, key)
     trial = None
+    changes = None
     for num_paths in _numbers_of_paths(estimate):
         sampling = IndependentPaths(num_paths, _batch_size(estimate))
         plan = sampling.prepare(finer_problem, key, devices)
         trial = run(plan._replace(is_quick=True), key, devices, start=trial)
         if trial.num_failed > _MOST_FAILED * num_paths:
             return None
-        change = _largest_change(trial, estimate)
-        if change.is_sure or not change.is_hidden:
+        change = combined_results(trial, Combination.BEST)
+        changes = _Changes(
+            sizes=np.abs(_numbers(change.mean)),
+            noise=_numbers(change.std_error),
+            errors=_numbers(estimate.error),
+            num_paths=num_paths,
+        )
+        if changes.are_sure or not changes.are_hidden:
             break
-    else:
-        return None
-    if not change.is_sure:
-        return None
-    h = float(problem.levels.h[-1]) / 2
-    return (
-        f"Steps are too long: on {num_paths} paths of a trial, a third level, with steps "
-        f"of {h:.3g}, changes a mean by {change.size:.2g} ± {change.noise:.1g}, which is "
-        f"more than its error, {change.error:.1g}. Pass a smaller `dt0`, or `tol`, which "
-        "takes smaller steps until they fit the order."
-    )
+    return changes
 
 
-class _Change(NamedTuple):
-    """The change of the mean that exceeds its error most.
-
-    - `size`, `noise`: its size and standard error.
-    - `error`: the error of the mean.
-    - `is_sure`: whether it is surely more than this error.
-    - `is_hidden`: whether the noise would hide a change as large as the error.
-    """
-
-    size: float
-    noise: float
-    error: float
-    is_sure: bool
-    is_hidden: bool
-
-
-def _largest_change(trial: Expectation, estimate: Expectation) -> _Change:
-    """The change of an estimate by a trial."""
-    change = combined_results(trial, Combination.BEST)
-    sizes = np.abs(_numbers(change.mean))
-    noise = _numbers(change.std_error)
-    errors = _numbers(estimate.error)
-    sure = np.sqrt(_SURE_OF_ONE**2 + 2 * np.log(sizes.size))
-    # What is not finite is larger than nothing.
-    excess = np.nan_to_num(sizes - sure * noise - errors, nan=-np.inf)
-    worst = np.argmax(excess)
-    return _Change(
-        size=float(sizes[worst]),
-        noise=float(noise[worst]),
-        error=float(errors[worst]),
-        is_sure=bool(excess[worst] > 0),
-        is_hidden=bool(np.any(sure * noise > errors)),
-    )
+def _changes_by_same_sampling(
+    estimate: Expectation,
+    problem: Problem,
+    key: PRNGKeyArray,
+    devices: Devices,
+    sampling: AbstractSampling,
+) -> _Changes | None:
+    """The changes on samples of the same kind with half the steps, as many as it takes;
+    `None` if too many fail."""
+    finer_problem = dataclasses.replace(problem, levels=halved(problem.levels))
+    with warnings.catch_warnings():
+        # The plan of the estimate has given the same warnings.
+        warnings.simplefilter("ignore")
+        plan = sampling.prepare(finer_problem, key, devices)
+    trial = None
+    changes = None
+    for part in _PARTS_OF_SAME_SAMPLING:
+        num_samples = max(plan.least_samples, estimate.num_samples // part)
+        plan = plan._replace(num_samples=num_samples)
+        trial = run(plan, key, devices, start=trial)
+        if trial.num_failed > _MOST_FAILED * num_samples * plan.paths_per_sample:
+            return None
+        noise = _numbers(trial.std_error)
+        changes = _Changes(
+            sizes=np.abs(_numbers(trial.mean) - _numbers(estimate.mean)),
+            noise=np.hypot(noise, _numbers(estimate.std_error)),
+            errors=_numbers(estimate.error),
+            num_paths=trial.num_paths,
+        )
+        if changes.are_sure or not changes.are_hidden:
+            break
+    return changes
 
 
 def _numbers_of_paths(estimate: Expectation) -> list[int]:
     """The numbers of paths of the trial of an estimate."""
-    # The fits of value functions take far longer than their paths.
-    if isinstance(estimate.sampling, ValueFunctions):
-        return list(_NUMBERS_OF_PATHS)
     first, *others = _NUMBERS_OF_PATHS
     first = min(first, estimate.num_paths // _PART)
     if first < _FEWEST_PATHS:
@@ -161,7 +255,6 @@ def _with_finer_level(problem: Problem, key: PRNGKeyArray) -> Problem:
         terms=terms,
         levels=levels,
         weights=weights[None].astype(problem.weights.dtype),
-        finest_steps=int(levels.num_steps[-1]),
     )
 
 

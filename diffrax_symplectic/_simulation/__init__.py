@@ -26,6 +26,7 @@ from .levels import (
     combinations,
     Combination,
     finer_change_weights,
+    halved,
     Level,
     level_weights,
     with_next_level,

@@ -242,7 +242,7 @@ def _compiled_problem(problem: Problem) -> Problem:
         levels=level,
         weights=jnp.ones((1, 1)),
         at_end=True,
-        finest_steps=1,
+        most_steps=1,
     )
 
 

@@ -51,6 +51,16 @@ def levels_of(dt0: float, steps_of_dt0: StepNumbers, levels: int, dtype: Any) ->
     )
 
 
+def halved(levels: Level) -> Level:
+    """Levels with half the steps of these."""
+    return Level(
+        index=levels.index,
+        h=levels.h / 2,
+        num_steps=2 * levels.num_steps,
+        saved_steps=2 * levels.saved_steps,
+    )
+
+
 def with_next_level(levels: Level) -> Level:
     """The levels, and one more."""
     saved_steps = np.asarray(levels.saved_steps)

@@ -101,8 +101,9 @@ class Problem(eqx.Module):
     # Which paths of the terms are one Brownian motion. Programs, whose keys are traced,
     # cannot tell.
     motion_numbers: tuple[int, ...] = eqx.field(static=True)
-    # The number of steps on the finest level. (Shapes must be known when compiling.)
-    finest_steps: int = eqx.field(static=True)
+    # The most steps of a level for which arrays have room: twice those of the finest one if
+    # a trial halves all steps. (Shapes must be known when compiling.)
+    most_steps: int = eqx.field(static=True)
 
     @staticmethod
     def of(
@@ -199,7 +200,7 @@ class Problem(eqx.Module):
             weights=np.asarray(weights, jnp.result_type(float)),
             at_end=ts is None,
             motion_numbers=motion_numbers(brownian_paths(terms)),
-            finest_steps=int(all_levels.num_steps[-1]),
+            most_steps=int(all_levels.num_steps[-1]) * (2 if levels == 2 else 1),
         )
 
     def level(self, index: IntScalarLike) -> Level:
@@ -207,6 +208,11 @@ class Problem(eqx.Module):
         if is_traced(index):
             return jtu.tree_map(lambda x: jnp.asarray(x)[index], self.levels)
         return jtu.tree_map(lambda x: x[index], self.levels)
+
+    @property
+    def finest_steps(self) -> int:
+        """The number of steps on the finest level."""
+        return int(self.levels.num_steps[-1])
 
     @property
     def digests(self) -> dict[str, str]:

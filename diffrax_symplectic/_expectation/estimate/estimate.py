@@ -47,7 +47,7 @@ class Expectation(eqx.Module):
     - `key_data`: the data of the random key.
 
     The other fields are what `save` stores beside these, and may change: `moments`,
-    `paths_per_sample`, `rounding_floor`, `tails` and `digests`.
+    `paths_per_sample`, `rounding_floor`, `tails`, `digests` and `caveat`.
     """
 
     # The moments of batches, with neighbours combined.
@@ -62,6 +62,8 @@ class Expectation(eqx.Module):
     # For value functions: the mean absolute deviation from the fitted mean in the tails, as
     # estimated by paths whose noise is wider or pushed to one side.
     tails: PyTree[np.ndarray] | None = None
+    # What the checks of the step could not see, in words.
+    caveat: str = ""
     # What tells this estimate from those of other arguments, by the names of these.
     digests: dict[str, str] | None = None
 
@@ -258,7 +260,7 @@ class Expectation(eqx.Module):
                     "of the estimates to merge. Pass a different `first` for each part."
                 )
         return dataclasses.replace(
-            self, moments=combined_in_halves(parts), tol_reached=None
+            self, moments=combined_in_halves(parts), tol_reached=None, caveat=""
         )
 
     def save(self, file: str | Path | BinaryIO) -> None:
@@ -307,6 +309,8 @@ class Expectation(eqx.Module):
         )
         if self.reason:
             lines.append(self.reason)
+        if self.caveat:
+            lines.append(self.caveat)
         if self.tol_reached is False:
             lines.append("`tol` was not reached")
         return "\n".join(lines)

@@ -46,7 +46,7 @@ def header_of(estimate: Any) -> dict[str, Any]:
         "tails": estimate.tails is not None,
     }
     header |= {name: getattr(estimate, name) for name in _FIELDS_OF_ESTIMATE}
-    return header | {"digests": estimate.digests}
+    return header | {"digests": estimate.digests, "caveat": estimate.caveat}
 
 
 def arrays_of(estimate: Any) -> dict[str, np.ndarray]:
@@ -101,6 +101,7 @@ def fields_from(
     fields = {name: header[name] for name in _FIELDS_OF_ESTIMATE}
     # Files of earlier versions have none.
     fields["digests"] = header.get("digests")
+    fields["caveat"] = header.get("caveat", "")
     if fields["digests"] is None:
         warnings.warn(
             "This estimate was saved without digests of its arguments: `merge` and "

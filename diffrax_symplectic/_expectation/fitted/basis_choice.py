@@ -141,9 +141,7 @@ def _too_many_for_least_squares(d: int) -> bool:
 
 def _num_functions(problem: Problem) -> int:
     """The number of functions in a fit: for all levels, steps, times and components."""
-    return (
-        len(problem.levels.h) * problem.finest_steps * math.prod(problem.output_shape)
-    )
+    return len(problem.levels.h) * problem.most_steps * math.prod(problem.output_shape)
 
 
 def _check_memory(problem: Problem, basis: Hermite) -> None:

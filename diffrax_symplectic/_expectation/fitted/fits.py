@@ -103,9 +103,9 @@ def fit(
             basis=basis,
         )
 
-    # All levels have arrays for the steps of the finest one, so that they share a program.
+    # All levels have arrays for the same number of steps, so that they share a program.
     def zeros_for_all_steps(of_step: jax.ShapeDtypeStruct) -> Array:
-        return jnp.zeros((problem.finest_steps, *of_step.shape), of_step.dtype)
+        return jnp.zeros((problem.most_steps, *of_step.shape), of_step.dtype)
 
     shape = (basis.size, len(basis.candidates), *problem.output_shape)
     struct_of_frame = jax.eval_shape(lambda: frame_after(0))
@@ -144,8 +144,8 @@ def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
         y = unravel(flat_y)
         x = None
         if key is not None:
-            # The pilot's own steps draw by the indices below `finest_steps`.
-            x, _ = noise.draw(key, problem.finest_steps + i)
+            # The pilot's own steps draw by the indices below `most_steps`.
+            x, _ = noise.draw(key, problem.most_steps + i)
         mean = noise.mean(next_step, y, lambda y1: fitted(next_step, y1), x)
         phi = problem.values(problem.t0 + (i + 1) * level.h, y).astype(mean.dtype)
         # Which of the times at which to average are the end of this step, or later.
@@ -174,7 +174,7 @@ def _second_derivatives(
     # The states before each step are those after the step before: (steps, paths, d).
     states_before = jnp.concatenate([pilot.starts[None], pilot.states[:-1]])
     few_states = states_before[:, :_STATES_FOR_SECOND]
-    steps = jnp.arange(noise.problem.finest_steps)
+    steps = jnp.arange(noise.problem.most_steps)
     return lax.map(mean_of_step, (steps, few_states))
 
 
@@ -220,7 +220,7 @@ def _run_pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
         problem, jax.vmap(problem.draw_start)(keys), solver_state=None
     )
     starts = jax.vmap(ravel)(paths.y)
-    states = jnp.broadcast_to(starts, (problem.finest_steps, *starts.shape))
+    states = jnp.broadcast_to(starts, (problem.most_steps, *starts.shape))
     carry = paths, states
     paths, states = lax.fori_loop(0, noise.level.num_steps, step_all, carry)
     return _Pilot(keys, starts, states, ~paths.failed)
