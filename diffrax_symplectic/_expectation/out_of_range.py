@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -21,13 +22,13 @@ _ARITHMETIC = {"mul": "*", "div": "/", "integer_pow": "to a power", "square": "s
 
 
 def out_of_range(problem: Problem, all_fail: bool) -> str | None:
-    """Names an argument that counts as zero in the precision of the state; or if
+    """Names an argument that counts as zero or infinite in its precision; or if
     `all_fail`, which paths do, an operation of the first step whose result is out of range.
     Two sentences for messages, or `None`."""
-    precision = np.finfo(problem.dtype)
+    precision = jnp.finfo(problem.dtype)
     drift, noise = split_terms(problem.terms)
     terms = (*drift, *noise)
-    found = next(_lost_arguments(problem, terms, float(precision.tiny)), None)
+    found = next(_lost_arguments(problem, terms), None)
     if found is None and all_fail:
         found = _lost_on_the_way(problem, terms)
     if found is None:
@@ -41,8 +42,8 @@ def out_of_range(problem: Problem, all_fail: bool) -> str | None:
     return f"In {precision.dtype}, {found}. {advice[0].upper()}{advice[1:]}"
 
 
-def _lost_arguments(problem: Problem, terms: Terms, tiny: float) -> Iterator[str]:
-    """The arguments with an array of which all numbers count as zero."""
+def _lost_arguments(problem: Problem, terms: Terms) -> Iterator[str]:
+    """The arguments with an array whose numbers all count as zero, or one as infinite."""
     arguments = {"y0": problem.y0, "args": problem.args, "dt0": problem.levels.h[0]}
     baths = [term for term in terms if isinstance(term, BathNoise)]
     for bath in baths:
@@ -51,10 +52,14 @@ def _lost_arguments(problem: Problem, terms: Terms, tiny: float) -> Iterator[str
         for leaf in jtu.tree_leaves(value):
             if not _is_float(leaf):
                 continue
+            # Numbers of Python have the precision of the state.
+            precision = jnp.finfo(jnp.result_type(leaf, problem.dtype))
             size = float(np.max(np.abs(_in_float64(leaf)), initial=0))
             # Numbers below `tiny` lose digits, and most processors take them for zero.
-            if 0 < size < tiny:
+            if 0 < size < precision.tiny:
                 yield f"`{name}` of {size:.2g} counts as zero"
+            if precision.max < size < np.inf:
+                yield f"`{name}` of {size:.2g} counts as infinite"
 
 
 def _lost_on_the_way(problem: Problem, terms: Terms) -> str | None:
@@ -108,7 +113,8 @@ def _loss(name: str, values: list[Any], result: Any) -> Iterator[str]:
 
 
 def _is_float(x: Any) -> bool:
-    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
+    """Whether this is a real array or number. Arguments may hold functions, too."""
+    return eqx.is_array_like(x) and jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 
 def _in_float64(x: Any) -> np.ndarray:

@@ -101,14 +101,14 @@ def test_a_mean_that_is_zero_within_its_spread_is_no_disagreement():
     assert _by_levels([0.09, 0.0], 0.01)
 
 
-def _junction(mass, T):
+def _junction(mass, T, args=None):
     single = jax.ShapeDtypeStruct((), jnp.float32)
     H0 = lambda t, p, q, args: p**2 / (2 * mass) - jnp.cos(q)
     terms = ds.langevin_terms(H0, jnp.float32(1), jnp.float32(T), single)
     y0 = jnp.float32(0), jnp.float32(1)
     phi = lambda t, y, args: jnp.cos(y[1])
     return ds.expectation(
-        phi, terms, ds.BAOAB(), 0, 0.5, 0.25, y0, key=KEY,
+        phi, terms, ds.BAOAB(), 0, 0.5, 0.25, y0, args, key=KEY,
         sampling=ds.ArrayRQMC(num_paths=64, replicates=2),
     )  # fmt: skip
 
@@ -121,3 +121,5 @@ def test_numbers_that_single_precision_loses_are_named_once():
     assert "is 0. Pass `y0` and what goes with it in float64" in message
     told = " ".join(_told(lambda: _junction(1.0, 1e-42)))
     assert "In float32, `temperature` of 1e-42 counts as zero." in told
+    told = " ".join(_told(lambda: _junction(1.0, 1.0, {"length": 1e60, "fn": jnp.sin})))
+    assert "In float32, `args` of 1e+60 counts as infinite." in told
