@@ -89,6 +89,7 @@ from ._terms import (
     from_spinors as from_spinors,
     hamiltonian_terms as hamiltonian_terms,
     IndexedNoise as IndexedNoise,
+    ito_drift as ito_drift,
     langevin_terms as langevin_terms,
     noise_terms as noise_terms,
     spin_terms as spin_terms,

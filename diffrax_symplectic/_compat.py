@@ -40,6 +40,18 @@ from jaxlib.mlir import ir
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 
+# Operations that only call a function, and the parameter that holds it.
+CALLS = {
+    "checkpoint": "jaxpr",
+    "closed_call": "call_jaxpr",
+    "custom_jvp_call": "call_jaxpr",
+    "custom_vjp_call": "call_jaxpr",
+    "custom_vmap_call": "call",
+    "jit": "jaxpr",
+    "pjit": "jaxpr",
+}
+
+
 def is_threefry(key: PRNGKeyArray) -> bool:
     """Whether the key belongs to JAX's default generator, by its name, which is all that
     JAX tells of a generator."""
@@ -223,6 +235,26 @@ def results_of_operation(eqn: JaxprEqn, args: Sequence[Any], params: Any) -> lis
     with eqn.ctx.manager:
         outs = eqn.primitive.bind(*functions, *args, **params)
     return outs if eqn.primitive.multiple_results else [outs]
+
+
+def results_of_program(
+    program: Jaxpr | ClosedJaxpr,
+    args: Sequence[Any],
+    results_of: Callable[[JaxprEqn, list[Any]], Sequence[Any]],
+) -> list[Any]:
+    """The results of a program for these arguments, operation by operation: `results_of`
+    gives those of one, for its arguments."""
+    jaxpr = getattr(program, "jaxpr", program)
+    consts = getattr(program, "consts", [])
+    values = dict(zip(jaxpr.constvars, consts)) | dict(zip(jaxpr.invars, args))
+
+    def value_of(atom: Any) -> Any:
+        return atom.val if isinstance(atom, Literal) else values[atom]
+
+    for eqn in jaxpr.eqns:
+        results = results_of(eqn, [value_of(atom) for atom in eqn.invars])
+        values.update(zip(eqn.outvars, results))
+    return [value_of(atom) for atom in jaxpr.outvars]
 
 
 def has_blocking_lapack() -> bool:

@@ -25,13 +25,14 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from ._compat import (
+    CALLS,
     ClosedJaxpr,
     has_blocking_lapack,
     is_program,
     Jaxpr,
-    Literal,
     programs_in,
     results_of_operation,
+    results_of_program,
 )
 
 
@@ -41,16 +42,6 @@ LAPACK = frozenset(
     "symmetric_product triangular_solve tridiagonal tridiagonal_solve".split()
 )
 _CONTROL_FLOW = frozenset({"cond", "scan", "while"})
-# Operations that only call a function, and the parameter that holds it.
-_CALLS = {
-    "checkpoint": "jaxpr",
-    "closed_call": "call_jaxpr",
-    "custom_jvp_call": "call_jaxpr",
-    "custom_vjp_call": "call_jaxpr",
-    "custom_vmap_call": "call",
-    "jit": "jaxpr",
-    "pjit": "jaxpr",
-}
 
 
 def lapack_in_turn(fn: Callable) -> Callable:
@@ -80,17 +71,7 @@ class _SequentialLapack:
 
     def run(self, program: Jaxpr | ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
         """The results of a program for these arguments."""
-        jaxpr = getattr(program, "jaxpr", program)
-        consts = getattr(program, "consts", [])
-        values = dict(zip(jaxpr.constvars, consts)) | dict(zip(jaxpr.invars, args))
-
-        def value_of(atom: Any) -> Any:
-            return atom.val if isinstance(atom, Literal) else values[atom]
-
-        for eqn in jaxpr.eqns:
-            results = self._results(eqn, [value_of(atom) for atom in eqn.invars])
-            values.update(zip(eqn.outvars, results))
-        return [value_of(atom) for atom in jaxpr.outvars]
+        return results_of_program(program, args, self._results)
 
     def _results(self, eqn: Any, args: list[Any]) -> Sequence[Any]:
         """The results of one operation. An operation that calls LAPACK waits for the last
@@ -98,8 +79,8 @@ class _SequentialLapack:
         name = eqn.primitive.name
         if not _calls_lapack(eqn):
             return results_of_operation(eqn, args, eqn.params)
-        if name in _CALLS:
-            return self.run(eqn.params[_CALLS[name]], args)
+        if name in CALLS:
+            return self.run(eqn.params[CALLS[name]], args)
         if name == "custom_linear_solve":
             solve, args_of_solve = _program_of_linear_solve(eqn, args)
             return self.run(solve, args_of_solve)

@@ -70,6 +70,10 @@ def test_every_page_is_looked_through():
     assert {"README.md", "docs/index.md", "docs/own_tableau.md"} <= PAGES.keys()
 
 
+def test_the_first_program_of_every_page_has_64_bits():
+    assert all("jax_enable_x64" in blocks[0] for blocks in PAGES.values())
+
+
 def test_no_code_takes_a_path_that_repeats_its_noise():
     shown = [*PAGES.values(), *DOCSTRINGS.values()]
     assert not any("UnsafeBrownianPath" in code for blocks in shown for code in blocks)

@@ -31,7 +31,7 @@ FLOORS = [
 FLOORS_OF_EXPECTATION = [
     ("sampling", "fields_in_time"),
     ("estimate", "batch", "cost", "kinks"),
-    ("jumps", "fast_drive", "long_steps", "strong_friction"),
+    ("jumps", "fast_drive", "long_steps", "out_of_range", "strong_friction"),
     ("run", "call"),
     ("independent", "fitted", "sorted"),
     ("fused_paths",),

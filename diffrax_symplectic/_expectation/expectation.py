@@ -43,6 +43,7 @@ from .fused_paths import FusedPaths
 from .jumps import jumps_at_step_ends, jumps_within_steps
 from .kinks import has_kinks
 from .long_steps import may_be_too_long, too_long_steps, unresolved_noise
+from .out_of_range import out_of_range
 from .run import Meter, NO_METER, run
 from .sampling import AbstractSampling
 from .strong_friction import unresolved_friction
@@ -176,7 +177,8 @@ def expectation(
     another decay; if forces or noise jump in time within a step, or at its end where the
     solver takes them, or change too fast for the steps; if none of these is the case, but a
     third level on at most 512 paths changes a mean of two levels by more than its error;
-    and if rounding in single precision may exceed the standard error.
+    and if rounding in single precision may exceed the standard error, or numbers count as
+    zero.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and
@@ -205,7 +207,10 @@ def expectation(
                 # Trial samples are not part of the estimate, and cannot be continued.
                 raise KeyboardInterrupt from None
             problem, used_sampling, plan = decision
-            estimate = run(plan, key, devices, used_sampling, start, first, tol, meter)
+            times = None if ts is None else np.array(ts, float).reshape(-1)
+            estimate = run(
+                plan, key, devices, used_sampling, start, first, tol, meter, times
+            )
             if tol is None or not may_add_levels or levels == _MOST_LEVELS:
                 break
             if not needs_level(estimate, tol):
@@ -214,7 +219,13 @@ def expectation(
 
     advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
     # `num_paths` are those that did not fail.
-    if estimate.num_failed > estimate.num_paths and may_be_too_long(problem):
+    most_fail = estimate.num_failed > estimate.num_paths
+    lost_numbers = out_of_range(problem, most_fail)
+    if lost_numbers is not None and most_fail:
+        advice = lost_numbers
+    elif lost_numbers is not None:
+        warnings.warn(lost_numbers, stacklevel=2)
+    elif most_fail and may_be_too_long(problem):
         advice = (
             f"Most likely, steps of `dt0={float(dt0):g}` are too long for "
             f"`{type(solver).__name__}`: pass `dt0={float(dt0) / 4:g}` or less, or an "

@@ -60,10 +60,12 @@ def run(
     first: int = 0,
     tol: float | None = None,
     meter: Meter | None = None,
+    ts: np.ndarray | None = None,
 ) -> Expectation:
     """The estimate from the samples of a plan, which continues `start`, or without it
     begins with sample number `first`. With a tolerance `tol` it may end before all samples
-    of the plan. The result does not depend on the number of devices."""
+    of the plan. The result does not depend on the number of devices. `ts` is that of
+    `Expectation`."""
     # The first sample of all, and the first that is not in `start`.
     begin = first if start is None else start.moments[0].begin
     next_sample = first if start is None else start.moments[-1].end
@@ -79,6 +81,7 @@ def run(
         reason=plan.reason,
         tails=plan.tails,
         digests=plan.digests,
+        ts=ts,
     )
     if start is not None:
         check_same(start, estimate, "`start`")

@@ -51,9 +51,11 @@ def check_friction(
         )
     if len(friction) == 0:
         raise ValueError(
-            f"`{solver_name}` takes friction from the terms, and these have none. "
-            "Construct them with `langevin_terms(H0, friction, temperature, path)`. "
-            "(Without friction use `StormerVerlet` or `ImplicitMidpoint`.)"
+            f"`{solver_name}` takes friction on the velocities dH0/dp from the terms, and "
+            "these have none. Construct them with `langevin_terms(H0, friction, "
+            "temperature, path)`. (Without such friction use `StormerVerlet` or "
+            "`ImplicitMidpoint`. A decay of the momenta, -p / tau, is another equation "
+            "unless H0 is quadratic in p.)"
         )
     if len(drift) == 0:
         raise ValueError(

@@ -7,6 +7,7 @@ What users call:
 - `langevin`: `langevin_terms` and `bath_terms`; a folder.
 - `spins`, `waves`: `spin_terms` and `wave_terms`, Hamiltonians of another variable, which
   `lifted` makes of `(p, q)`.
+- `ito`: `ito_drift`, for noise in the sense of Ito.
 - `constraint`: `constrained_state`, and the surface that a constraint leaves; a folder.
 
 What solvers and expectations ask of terms, from the bottom up:
@@ -32,6 +33,7 @@ from .dependence import acts_elementwise, Dependence
 from .drift_and_noise import control_struct, field_of, number_of_noises, split_terms
 from .evaluation import call_user_function
 from .hamiltonian import hamiltonian_terms, noise_terms
+from .ito import ito_drift
 from .langevin import AbstractFriction, bath_terms, BathNoise, friction_apart
 from .langevin import FrictionAlong, langevin_terms, momentum_first
 from .langevin import semidefinite_root, split_friction

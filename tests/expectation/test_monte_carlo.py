@@ -257,8 +257,9 @@ def test_an_estimate_prints_every_number_of_the_mean_in_a_line_with_its_place():
         lambda key: {"a": ones(key), "b": 2.0}, key=jr.key(0), num_paths=10
     )
     lines = str(got).splitlines()
-    assert lines[0] == "['a'][0, 0]: 1. ± 2.2e-16"
-    assert lines[29:31] == ["['a'][4, 5]: 1. ± 2.2e-16", "['b']: 2. ± 4.4e-16"]
+    assert lines[0] == "['a'][0, 0]: 1.000000000000000 ± 2.2e-16"
+    assert lines[29] == "['a'][4, 5]: 1.000000000000000 ± 2.2e-16"
+    assert lines[30] == "['b']: 2.000000000000000 ± 4.4e-16"
     assert len(lines) == 33 and "10 paths on 1 level, 0 failed" in lines[-1]
 
 

@@ -525,7 +525,7 @@ OF_P = diffrax.MultiTerm(
         (lambda: ds.BAOAB(steps=2), "those of a solver: pass one as `flow`"),
         (lambda: ds.BAOAB(CHAIN, steps=2), "those of a solver"),
         (_call(ds.BAOAB(lambda time, y, args: y[0])), "must return a pair like the state"),
-        (_call(FLOWS["midpoint"], ds.hamiltonian_terms(_stiff)), "takes friction from"),
+        (_call(FLOWS["midpoint"], ds.hamiltonian_terms(_stiff)), "takes friction on"),
         (_call(FLOWS["midpoint"], QUARTIC), "friction that is linear in p"),
         (_call(FLOWS["midpoint"], OF_P), "needs H0 = V.* noise Hamiltonians"),
         (lambda: _chain(slow=lambda t, p, q, args: 0.0), "`slow`"),

@@ -9,7 +9,8 @@ import numpy as np
 
 from ..._simulation import Combination
 from ..sampling import ROUNDING
-from .estimate import combined_results, Expectation
+from .error_bars import least_deviation, share_of_largest
+from .estimate import combined_results, Expectation, labels
 from .moments import total
 from .tolerance import largest_error, shortfall
 
@@ -24,6 +25,9 @@ _NEGLIGIBLE_BELOW = 100
 # share of it. For a method of order 2, the bias of the longer step is four times this
 # change, and thus more than twice the mean.
 _MUCH = 0.5
+# The change must also be this share of the standard deviation of a path: a mean of zero is
+# zero up to its spread, and any change of it is large beside it.
+_MUCH_OF_SPREAD = 0.05
 # The change must also be this many of its standard errors: by chance it is more once in
 # sixteen thousand times.
 _SURE_OF_CHANGE = 4
@@ -87,19 +91,41 @@ def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
             "Pass a smaller `degree`, or another `sampling`."
         )
 
-    def may_be_off(heaviness: Any, std_error: Any, error: Any) -> Any:
-        matters = _NEGLIGIBLE_BELOW * std_error >= error
-        return np.any((heaviness > _HEAVY) & matters)
-
-    is_off = jtu.tree_map(
-        may_be_off, best.heaviness, estimate.std_error, estimate.error
-    )
-    if any(jtu.tree_leaves(is_off)):
+    # Paths that count little would not matter.
+    matters = jtu.tree_map(_matters, estimate.std_error, estimate.error)
+    heaviness = jtu.tree_map(np.multiply, best.heaviness, matters)
+    place = _place_of_largest(heaviness)
+    r = _flat(heaviness)[place]
+    if r > _HEAVY:
+        # For sorted paths, each replicate is looked at by itself.
+        is_replicate = estimate.paths_per_sample > 1
+        n = estimate.paths_per_sample if is_replicate else estimate.num_samples
+        share = share_of_largest(r, n)
         yield (
-            f"A few of the {estimate.num_paths:,} paths account for most of the variance: "
-            "still rarer paths may contribute much to the mean, and the standard error may "
-            "be too small. Take many more paths, or a function that grows more slowly."
+            f"One path in {n:,} accounts for {share:.0%} of the variance"
+            f"{_label(estimate, place)}: still rarer paths may contribute much to the "
+            "mean, and the standard error may be too small. Take many more paths. If `phi` "
+            "grows fast, average a function that grows more slowly."
         )
+
+
+def _matters(std_error: Any, error: Any) -> Any:
+    return _NEGLIGIBLE_BELOW * std_error >= error
+
+
+def _place_of_largest(values: Any) -> int:
+    """The place of the largest of these values, of all numbers of the mean."""
+    return int(np.argmax(np.nan_to_num(_flat(values))))
+
+
+def _flat(tree: Any) -> np.ndarray:
+    return np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(tree)])
+
+
+def _label(estimate: Expectation, place: int) -> str:
+    """Which of several numbers of the mean this is, for messages."""
+    label = labels(estimate)[place]
+    return f" ({label})" if label else ""
 
 
 def _cautions_on_samples(estimate: Expectation) -> Iterator[str]:
@@ -127,26 +153,54 @@ def _cautions_on_steps(estimate: Expectation) -> Iterator[str]:
     if estimate.levels != 2:
         return
 
-    def disagrees(change: Any, noise: Any, finest: Any, size: Any, dtype: str) -> Any:
+    def disagreement(
+        change: Any, noise: Any, finest: Any, spread: Any, size: Any, dtype: str
+    ) -> Any:
+        size_of_change = np.abs(change)
         rounding = ROUNDING * float(jnp.finfo(dtype).eps) * size[Combination.BEST]
-        is_real = np.abs(change) > np.maximum(_SURE_OF_CHANGE * noise, rounding)
-        is_large = np.abs(change) > _MUCH * np.abs(finest)
-        return np.any(is_real & is_large)
+        is_real = size_of_change > np.maximum(_SURE_OF_CHANGE * noise, rounding)
+        is_large = size_of_change > _MUCH * np.abs(finest)
+        is_seen = size_of_change > _MUCH_OF_SPREAD * spread
+        # The mean may be zero.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio = size_of_change / np.abs(finest)
+        return np.where(is_real & is_large & is_seen, ratio, 0)
 
     change = combined_results(estimate, Combination.EXTRAPOLATION)
     finest = jtu.tree_map(np.add, estimate.mean, estimate.bias)
     moments = total(estimate.moments)
     # The largest absolute values of samples, by which their rounding is measured.
     size = jtu.tree_map(np.fmax, moments.size.value, moments.size.without_control)
-    is_wrong = jtu.tree_map(
-        disagrees, change.mean, change.std_error, finest, size, moments.dtypes
+    ratios = jtu.tree_map(
+        disagreement,
+        change.mean,
+        change.std_error,
+        finest,
+        _spread_of_paths(estimate),
+        size,
+        moments.dtypes,
     )
-    if any(jtu.tree_leaves(is_wrong)):
+    place = _place_of_largest(ratios)
+    if _flat(ratios)[place] > 0:
         yield (
-            "The first two steps do not agree: extrapolation from steps of `dt0` and half "
-            "of it changes the mean by more than half of it. Pass a smaller `dt0`, or "
-            "`levels=3`, which checks the order."
+            f"The first two steps do not agree{_label(estimate, place)}: extrapolation "
+            "from steps of `dt0` and half of it changes the mean from "
+            f"{_flat(finest)[place]:.3g} to {_flat(estimate.mean)[place]:.3g}. Pass a "
+            "smaller `dt0`, or `levels=3`, which checks the order."
         )
+
+
+def _spread_of_paths(estimate: Expectation) -> Any:
+    """The standard deviation of the values of a path, or for sorted paths a number that is
+    not above it."""
+    best = combined_results(estimate, Combination.BEST)
+    if estimate.paths_per_sample == 1:
+        return best.plain_s
+    return jtu.tree_map(
+        lambda largest, r: least_deviation(largest, r, estimate.paths_per_sample),
+        best.spread,
+        best.heaviness,
+    )
 
 
 def _dtype_of_underflow(estimate: Expectation) -> str | None:

@@ -41,12 +41,25 @@ def heaviness(largest: Any, s: Any, n: Any, numpy: Any = np) -> Any:
     return numpy.maximum(largest - largest_of_normal, 0) / (s * numpy.sqrt(n))
 
 
+def share_of_largest(r: Any, n: int) -> Any:
+    """The share of the sum of squared deviations of `n` values that is that of the largest
+    alone, from their `heaviness`, which must not be zero."""
+    return np.minimum((r + np.sqrt(_OUTLYING * np.log(max(n, 2)) / n)) ** 2, 1)
+
+
+def least_deviation(largest: Any, r: Any, n: int) -> Any:
+    """The standard deviation of `n` values, from their largest deviation and their
+    `heaviness`; if that is zero, the least that it can be."""
+    return largest / (r * np.sqrt(n) + np.sqrt(_OUTLYING * np.log(max(n, 2))))
+
+
 class Results(NamedTuple):
     """What follows from the moments of samples, for one combination of levels. Each field
     has the structure of `phi`, with a leading axis of times, if any.
 
     - `mean`, `std_error`, `variance`: as in `Expectation`.
     - `plain_std_error`: the standard error without a control variate.
+    - `plain_s`: the standard deviation of a sample without a control variate.
     - `heaviness`: the `r` of `Expectation.std_error`.
     - `dropped`: whether a control variate was dropped because its mean is not zero.
     - `spread`: the largest deviation of a path's value from the mean, without control. (For
@@ -56,6 +69,7 @@ class Results(NamedTuple):
     mean: PyTree[np.ndarray]
     std_error: PyTree[np.ndarray]
     plain_std_error: PyTree[np.ndarray]
+    plain_s: PyTree[np.ndarray]
     variance: PyTree[np.ndarray]
     heaviness: PyTree[np.ndarray]
     dropped: PyTree[np.ndarray]
@@ -141,6 +155,7 @@ def _results_of_array(n: int, rounding_floor: int, moments: _ArrayMoments) -> Re
         mean=mean.value,
         std_error=value_spread.std_error,
         plain_std_error=value_spread.std_error,
+        plain_s=value_spread.s,
         variance=value_spread.s**2,
         heaviness=value_spread.r,
         dropped=np.zeros(plain_mean.shape, bool),
@@ -179,6 +194,7 @@ def _results_with_control(
         mean=np.where(dropped, mean.plain, mean.value),
         std_error=np.where(dropped, plain_spread.std_error, std_error),
         plain_std_error=plain_spread.std_error,
+        plain_s=plain_spread.s,
         variance=np.where(dropped, plain_spread.s**2, results.variance),
         heaviness=np.where(dropped, plain_spread.r, results.heaviness),
         dropped=dropped,

@@ -45,6 +45,8 @@ class Expectation(eqx.Module):
     - `tol_reached`: whether the `error` of every mean is at most `tol` and the changes from
         step to step fit the order; `None` without `tol`.
     - `key_data`: the data of the random key.
+    - `ts`: the times of the leading axis of `mean`, or `None` without this axis. (Also for
+        estimates from files of earlier versions.)
 
     The other fields are what `save` stores beside these, and may change: `moments`,
     `paths_per_sample`, `rounding_floor`, `tails`, `digests` and `caveat`.
@@ -66,6 +68,7 @@ class Expectation(eqx.Module):
     caveat: str = ""
     # What tells this estimate from those of other arguments, by the names of these.
     digests: dict[str, str] | None = None
+    ts: np.ndarray | None = None
 
     @property
     def levels(self) -> int:
@@ -294,8 +297,6 @@ class Expectation(eqx.Module):
         # Only the trials that choose a sampling have none themselves.
         if self.levels == 1 and self.sampling is not None:
             lines.append("not included: the discretization error (see `levels`)")
-        if self.levels == 2:
-            lines.append("the order of the solver is unchecked (see `levels`)")
         if any(np.any(is_off) for is_off in jtu.tree_leaves(self.off_order)):
             lines.append(
                 "the changes from step to step do not fit the order: the largest of them "
@@ -318,10 +319,10 @@ class Expectation(eqx.Module):
     __repr__ = __str__
 
     def _lines_of_means(self) -> list[str]:
-        """A line for each number of the mean, such as `['energy'][0]: 0.364083 ± 8.6e-05
-        (sampling 5.1e-05, discretization 6.9e-05)`: the place of the number in the PyTree,
-        if there is one, the number, its error, and the parts of the error, if there are
-        several."""
+        """A line for each number of the mean, such as `t=2, ['energy'][0]: 0.364083 ±
+        8.6e-05 (sampling 5.1e-05, discretization 6.9e-05)`: its time and its place in the
+        PyTree, if there are several, the number, its error, and the parts of the error, if
+        there are several."""
         errors_by_source = {"sampling": _numbers(self.std_error)}
         if self.levels > 1:
             errors_by_source["discretization"] = _numbers(self.discretization_error)
@@ -330,7 +331,7 @@ class Expectation(eqx.Module):
         means = _numbers(self.mean)
         errors = _numbers(self.error)
         lines = []
-        for k, label in enumerate(_labels(self.mean)):
+        for k, label in enumerate(labels(self)):
             line = f"{_rounded(means[k], errors[k])} ± {errors[k]:.1e}"
             if len(errors_by_source) > 1:
                 sources = [f"{name} {x[k]:.1e}" for name, x in errors_by_source.items()]
@@ -395,25 +396,42 @@ def _numbers(tree: PyTree[np.ndarray | np.floating] | None) -> list[float]:
     return [float(x) for leaf in jtu.tree_leaves(tree) for x in np.ravel(leaf)]
 
 
-def _labels(tree: PyTree[np.ndarray | np.floating]) -> list[str]:
-    """The place of each number in a PyTree of arrays, such as `['energy'][0, 2]`; the
-    empty string for a single array without axes."""
-    labels = []
-    for path, leaf in jtu.tree_leaves_with_path(tree):
+def labels(estimate: Expectation) -> list[str]:
+    """The time and the place in the PyTree of each number of the mean, such as `t=2,
+    ['energy'][0]`; the empty string for a single number."""
+    found = []
+    for path, leaf in jtu.tree_leaves_with_path(estimate.mean):
         for index in np.ndindex(np.shape(leaf)):
-            place = f"[{', '.join(map(str, index))}]" if index else ""
-            labels.append(jtu.keystr(path) + place)
-    return labels
+            time = ""
+            if estimate.ts is not None:
+                first, *index = index
+                time = f"t={estimate.ts[first]:.7g}"
+            entry = f"[{', '.join(map(str, index))}]" if index else ""
+            place = jtu.keystr(path) + entry
+            found.append(", ".join(filter(None, (time, place))))
+    return found
 
 
 def _rounded(mean: float, error: float) -> str:
-    """The mean, rounded to two digits of its error: `0.364083` for an error of 8.6e-05."""
-    # No error is shown with more decimals than float64 has, and none with fewer than one.
-    size = np.clip(np.nan_to_num(error), 1e-15, 1)
-    decimals = 1 - math.floor(math.log10(size))
-    # With more decimals, the mean's own digits may end first.
-    mode = "fixed" if decimals < 14 else "maxprec"
-    return np.array2string(np.asarray(mean), precision=decimals, floatmode=mode)
+    """The mean, rounded to two digits of its error: `0.364083` for an error of 8.6e-05,
+    `4.372e-44` for one of 1.2e-46."""
+    if not (np.isfinite(mean) and 0 < error < np.inf):
+        return f"{mean:.6g}"
+    exponent = _exponent(max(abs(mean), error))
+    # The place of the last digit. Beyond the fifteenth, float64 has none.
+    place = max(_exponent(error) - 1, exponent - 15)
+    # The sum makes a negative zero positive.
+    rounded = round(mean, -place) + 0.0
+    if -5 < exponent < 7:
+        return f"{rounded:.{max(-place, 0)}f}"
+    if rounded == 0:
+        return "0"
+    return f"{rounded:.{max(_exponent(abs(rounded)) - place, 0)}e}"
+
+
+def _exponent(size: float) -> int:
+    """The exponent of a positive number in scientific notation."""
+    return math.floor(math.log10(size))
 
 
 class ExpectationInterrupted(KeyboardInterrupt):

@@ -58,6 +58,8 @@ def arrays_of(estimate: Any) -> dict[str, np.ndarray]:
             for field, tree in getattr(moments, name).fields.items():
                 trees[_name_of_tree(name, field, batch)] = tree
     arrays = {"key_data": estimate.key_data}
+    if estimate.ts is not None:
+        arrays["ts"] = estimate.ts
     for name, tree in trees.items():
         for leaf, array in enumerate(jtu.tree_leaves(tree)):
             arrays[_name_of_leaf(name, leaf)] = np.asarray(array)
@@ -113,6 +115,7 @@ def fields_from(
         "key_data": arrays["key_data"],
         "sampling": _sampling_from(header),
         "tails": tree("tails") if header["tails"] else None,
+        "ts": arrays["ts"] if "ts" in arrays else None,
     }
 
 

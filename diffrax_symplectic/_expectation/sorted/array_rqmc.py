@@ -199,7 +199,9 @@ def _samples_of_replicate(
         largest=problem.unravel_samples(largest),
     )
     num_failed = jnp.sum(simulated.failed, axis=1, keepdims=True)
-    return Samples(averaged, good=jnp.ones(1, bool), num_failed=num_failed)
+    # Of no paths there is no mean.
+    has_paths = jnp.all(num_failed < n, axis=0)
+    return Samples(averaged, good=has_paths, num_failed=num_failed)
 
 
 def _words_of_paths(

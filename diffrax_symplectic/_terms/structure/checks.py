@@ -48,10 +48,12 @@ _NO_GRADIENT = (
     "`BAOAB()` takes for a force of t and q, and `BAOAB(ImplicitMidpoint())` for any."
 )
 FRICTION = (
-    "Take friction from `langevin_terms(H0, friction, temperature, path)`: solvers for "
-    "heat baths, such as `BAOAB()`, or `BAOAB(ImplicitMidpoint())` for masses that depend "
-    "on positions, treat it by a step of its own. (All need a kinetic energy that is "
-    "quadratic in p.)"
+    "A decay of the momenta, -p / tau, is another equation than friction on the "
+    "velocities, -G dH0/dp, unless H0 is quadratic in p: keep its term, and use a solver "
+    "for general systems, for example `ImplicitMidpoint`. Take friction on the velocities "
+    "from `langevin_terms(H0, friction, temperature, path)`: solvers for heat baths, such "
+    "as `BAOAB()`, or `BAOAB(ImplicitMidpoint())` for masses that depend on positions, "
+    "treat it by a step of its own. (All need a kinetic energy that is quadratic in p.)"
 )
 
 

@@ -1,0 +1,121 @@
+"""Numbers that the precision of the state cannot hold, as in SI units in float32."""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array
+
+from .._compat import CALLS, results_of_operation, results_of_program
+from .._custom_types import Terms
+from .._simulation import Problem
+from .._terms import BathNoise, control_struct, split_terms
+
+
+# Operations whose results may be out of range where their arguments are not, and signs for
+# them in messages.
+_ARITHMETIC = {"mul": "*", "div": "/", "integer_pow": "to a power", "square": "squared"}
+
+
+def out_of_range(problem: Problem, all_fail: bool) -> str | None:
+    """Names an argument that counts as zero or infinite in its precision; or if
+    `all_fail`, which paths do, an operation of the first step whose result is out of range.
+    Two sentences for messages, or `None`."""
+    precision = jnp.finfo(problem.dtype)
+    drift, noise = split_terms(problem.terms)
+    terms = (*drift, *noise)
+    found = next(_lost_arguments(problem, terms), None)
+    if found is None and all_fail:
+        found = _lost_on_the_way(problem, terms)
+    if found is None:
+        return None
+    more_digits = ""
+    if jnp.result_type(float) == jnp.float32:
+        more_digits = 'Call `jax.config.update("jax_enable_x64", True)` first, or '
+    elif precision.bits < 64:
+        more_digits = "Pass `y0` and what goes with it in float64, or "
+    advice = f"{more_digits}choose units in which these numbers are near 1."
+    return f"In {precision.dtype}, {found}. {advice[0].upper()}{advice[1:]}"
+
+
+def _lost_arguments(problem: Problem, terms: Terms) -> Iterator[str]:
+    """The arguments with an array whose numbers all count as zero, or one as infinite."""
+    arguments = {"y0": problem.y0, "args": problem.args, "dt0": problem.levels.h[0]}
+    baths = [term for term in terms if isinstance(term, BathNoise)]
+    for bath in baths:
+        arguments |= {"friction": bath.friction, "temperature": bath.temperature}
+    for name, value in arguments.items():
+        for leaf in jtu.tree_leaves(value):
+            if not _is_float(leaf):
+                continue
+            # Numbers of Python have the precision of the state.
+            precision = jnp.finfo(jnp.result_type(leaf, problem.dtype))
+            size = float(np.max(np.abs(_in_float64(leaf)), initial=0))
+            # Numbers below `tiny` lose digits, and most processors take them for zero.
+            if 0 < size < precision.tiny:
+                yield f"`{name}` of {size:.2g} counts as zero"
+            if precision.max < size < np.inf:
+                yield f"`{name}` of {size:.2g} counts as infinite"
+
+
+def _lost_on_the_way(problem: Problem, terms: Terms) -> str | None:
+    """The first operation whose result is out of range, if the change of the state or `phi`
+    is not finite at the start."""
+    t0, y0, args = problem.t0, problem.y0, problem.args
+    leaves, treedef = jtu.tree_flatten(y0)
+
+    def first_evaluation(*leaves: Any) -> Any:
+        y = treedef.unflatten(leaves)
+        structs = [control_struct(term, t0) for term in terms]
+        controls = [jtu.tree_map(_ones, struct) for struct in structs]
+        changes = [term.vf_prod(t0, y, args, x) for term, x in zip(terms, controls)]
+        return changes, problem.phi(t0, y, args)
+
+    losses: list[str] = []
+
+    def results_of(eqn: Any, values: list[Any]) -> Sequence[Any]:
+        name = eqn.primitive.name
+        if name in CALLS:
+            return results_of_program(eqn.params[CALLS[name]], values, results_of)
+        results = results_of_operation(eqn, values, eqn.params)
+        if name in _ARITHMETIC and _is_float(results[0]):
+            losses.extend(_loss(name, values, results[0]))
+        return results
+
+    traced = jax.make_jaxpr(first_evaluation)(*leaves)
+    results = results_of_program(traced, leaves, results_of)
+    are_finite = all(np.all(np.isfinite(_in_float64(x))) for x in results)
+    return None if are_finite or len(losses) == 0 else losses[0]
+
+
+def _ones(struct: jax.ShapeDtypeStruct) -> Array:
+    return jnp.ones(struct.shape, struct.dtype)
+
+
+def _loss(name: str, values: list[Any], result: Any) -> Iterator[str]:
+    """An entry that overflowed or underflowed in an operation of arithmetic."""
+    result = _in_float64(result)
+    operands = [np.broadcast_to(_in_float64(x), result.shape).ravel() for x in values]
+    result = result.ravel()
+    # Zeros and infinities that stem from others are no losses.
+    is_fine = np.all([np.isfinite(x) & (x != 0) for x in operands], axis=0)
+    is_lost = is_fine & ((result == 0) | ~np.isfinite(result))
+    if np.any(is_lost):
+        first = int(np.argmax(is_lost))
+        texts = [f"{operand[first]:.2g}" for operand in operands]
+        sign = _ARITHMETIC[name]
+        text = f" {sign} ".join(texts) if len(texts) > 1 else f"{texts[0]} {sign}"
+        yield f"{text} is {'0' if result[first] == 0 else 'infinite'}"
+
+
+def _is_float(x: Any) -> bool:
+    """Whether this is a real array or number. Arguments may hold functions, too."""
+    return eqx.is_array_like(x) and jnp.issubdtype(jnp.result_type(x), jnp.floating)
+
+
+def _in_float64(x: Any) -> np.ndarray:
+    return np.asarray(x).astype(float)
