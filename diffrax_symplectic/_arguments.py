@@ -99,14 +99,16 @@ def check_solver(name: str, solver: Any) -> None:
     )
 
 
-def whole_number(name: str, value: Any, least: int = 1) -> int:
+def whole_number(name: str, value: Any, least: int = 1, most: int | None = None) -> int:
     """The value of the argument of this name, as an integer of Python. Raises a
-    `ValueError` unless it is an integer, `least` or larger."""
+    `ValueError` unless it is an integer, from `least` to `most`."""
     # `True` is an integer to Python.
     is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not is_integer or value < least:
+    if not is_integer or value < least or (most is not None and value > most):
         expected = "a positive integer"
-        if least != 1:
+        if most is not None:
+            expected = f"an integer from {least} to {most}"
+        elif least != 1:
             expected = f"an integer, {least} or larger"
         raise ValueError(f"`{name}` must be {expected}; got {value!r}.")
     return int(value)
