@@ -19,7 +19,7 @@ from .._simulation import advice_on_failures, combinations, level_weights
 from .call import checked_call
 from .estimate import cautions, Expectation
 from .independent import IndependentPaths
-from .run import Meter, NO_METER, run
+from .run import Kept, Meter, NO_METER, run
 from .sampling import Averaged, Samples
 
 
@@ -116,11 +116,12 @@ def monte_carlo(
     plan = sampling.plan(
         jtu.Partial(_samples_of_function, fn, weights), levels, devices
     )
-    with Meter(progress_meter) as meter:
-        estimate = run(plan, key, devices, sampling, start, first, tol, meter)
-    advice = advice_on_failures(has_bounded_increments=False, is_implicit=False)
-    for message in cautions(estimate, tol, advice):
-        warnings.warn(message, stacklevel=2)
+    with Kept() as kept:
+        with Meter(progress_meter) as meter:
+            estimate = run(plan, key, devices, sampling, start, first, tol, meter, kept)
+        advice = advice_on_failures(has_bounded_increments=False, is_implicit=False)
+        for message in cautions(estimate, tol, advice):
+            warnings.warn(message, stacklevel=2)
     return estimate
 
 
