@@ -1,6 +1,9 @@
 """Checks of arguments: functions, numbers, solvers, states."""
 
 import inspect
+import math
+import os
+from collections.abc import Hashable, Iterator
 from typing import Any
 
 import diffrax
@@ -99,6 +102,57 @@ def check_solver(name: str, solver: Any) -> None:
     )
 
 
+def check_made_for_noise(solver: diffrax.AbstractSolver) -> None:
+    """Raises a `ValueError` for solvers of Diffrax that are for equations without noise, or
+    that wrap another one."""
+    kinds = diffrax.AbstractItoSolver | diffrax.AbstractStratonovichSolver
+    is_of_diffrax = type(solver).__module__.startswith("diffrax.")
+    # `isinstance` would look through a `diffrax.HalfSolver`.
+    if is_of_diffrax and not issubclass(type(solver), kinds):
+        raise ValueError(
+            "`solver` must take fixed steps and be for equations with noise, as those of "
+            f"`suggest_solver` are; got {solver!r}."
+        )
+
+
+def check_terms(terms: Any) -> None:
+    """Raises a `ValueError` unless this is a term."""
+    if not isinstance(terms, diffrax.AbstractTerm):
+        raise ValueError(
+            "`terms` must be a term of Diffrax, such as `hamiltonian_terms` returns; got a "
+            f"{type(terms).__name__}. Several terms are one as `diffrax.MultiTerm(*terms)`."
+        )
+
+
+def check_args(args: Any) -> None:
+    """Raises a `ValueError` for `args` of which no program can be compiled."""
+    for leaf in jtu.tree_leaves(args):
+        # Words and functions may be compared and called.
+        is_constant = isinstance(leaf, Hashable) and not isinstance(leaf, Iterator)
+        if not (is_numeric(leaf) or (is_constant and not eqx.is_array_like(leaf))):
+            raise ValueError(
+                "`args` must hold arrays, in tuples, lists and dictionaries, or in an "
+                f"`equinox.Module`; got a {type(leaf).__name__}, {leaf!r}."
+            )
+
+
+def check_numbers(name: str, tree: PyTree) -> None:
+    """Raises a `ValueError` if the argument of this name, a PyTree, holds anything else
+    than numbers and arrays of numbers."""
+    for leaf in jtu.tree_leaves(tree):
+        if not is_numeric(leaf):
+            raise ValueError(
+                f"`{name}` must hold numbers and arrays of numbers, in tuples, lists and "
+                f"dictionaries; got a {type(leaf).__name__}, {leaf!r}."
+            )
+
+
+def is_numeric(leaf: Any) -> bool:
+    """Whether JAX takes this for an array."""
+    has_objects = getattr(leaf, "dtype", np.dtype(float)).kind in "OSUMm"
+    return eqx.is_array_like(leaf) and not has_objects
+
+
 def whole_number(name: str, value: Any, least: int = 1, most: int | None = None) -> int:
     """The value of the argument of this name, as an integer of Python. Raises a
     `ValueError` unless it is an integer, from `least` to `most`."""
@@ -114,11 +168,43 @@ def whole_number(name: str, value: Any, least: int = 1, most: int | None = None)
     return int(value)
 
 
+def check_memory(
+    name: str, number: int, bytes_of_each: int, device: Any = None
+) -> None:
+    """Raises a `ValueError` if the argument of this name asks for more paths at once than
+    fit the memory of a device, by default of this machine. `bytes_of_each` is the least
+    that a path takes."""
+    needed = number * bytes_of_each
+    memory = _memory_of(device)
+    if needed > memory:
+        raise ValueError(
+            f"`{name}={number}`: so many paths take {needed / 1e9:,.0f} GB or more, of "
+            f"{memory / 1e9:,.0f} GB. Pass a smaller `{name}`."
+        )
+
+
+def _memory_of(device: Any) -> float:
+    """The memory of a device in bytes, or infinity if that is not known."""
+    if device is not None and device.platform != "cpu":
+        statistics = device.memory_stats() or {}
+        return statistics.get("bytes_limit", math.inf)
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError):
+        # Not every system says it.
+        return math.inf
+
+
 def check_real(name: str, leaves: list) -> None:
     """Raises a `ValueError` unless the function of this name returned `leaves` that are
     real: one or more arrays, numbers or structs of arrays."""
     if len(leaves) == 0:
         raise ValueError(f"`{name}` must return real arrays; it returned none.")
+    if any(np.size(leaf) == 0 for leaf in leaves if hasattr(leaf, "shape")):
+        raise ValueError(
+            f"`{name}` must return arrays with one entry or more; got shapes "
+            f"{[jnp.shape(leaf) for leaf in leaves]}."
+        )
     dtypes = [getattr(leaf, "dtype", type(leaf)) for leaf in leaves]
     if not all(_is_real(dtype) for dtype in dtypes):
         raise ValueError(
@@ -194,6 +280,7 @@ def check_state(caller: str, y0: Y) -> None:
     leaves = jtu.tree_leaves(y0)
     if len(leaves) == 0:
         raise ValueError(f"`{caller}` needs a state with at least one array.")
+    check_numbers("y0", y0)
     for leaf in leaves:
         dtype = jnp.result_type(leaf)
         if jnp.issubdtype(dtype, jnp.complexfloating):

@@ -15,7 +15,12 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 from .._arguments import check_real, check_takes, whole_number
 from .._compat import is_result
 from .._root_finder import all_finite
-from .._simulation import advice_on_failures, combinations, level_weights
+from .._simulation import (
+    advice_on_failures,
+    combinations,
+    level_weights,
+    MOST_LEVELS,
+)
 from .call import checked_call
 from .estimate import cautions, Expectation
 from .independent import IndependentPaths
@@ -98,7 +103,7 @@ def monte_carlo(
     equal, as they are if `fn` does not use its key.
     """
     key, first, devices = checked_call("monte_carlo", key, tol, start, first, devices)
-    levels = whole_number("levels", levels)
+    levels = whole_number("levels", levels, 1, MOST_LEVELS)
     if levels > 1 and order is None:
         raise ValueError(
             "Several `levels` need `order=`, the weak order of the solver; got "
@@ -113,9 +118,10 @@ def monte_carlo(
         raise ValueError(f"`order` must be a positive integer, or 1/2; got {order!r}.")
     sampling = IndependentPaths(num_paths, batch_size)
     weights = level_weights(float(order or 1), levels)
-    plan = sampling.plan(
-        jtu.Partial(_samples_of_function, fn, weights), levels, devices
-    )
+    sampler = jtu.Partial(_samples_of_function, fn, weights)
+    # A number on each level, or more.
+    bytes_of_path = 4 * levels
+    plan = sampling.plan(sampler, levels, devices, bytes_of_path)
     with Kept() as kept:
         with Meter(progress_meter) as meter:
             estimate = run(plan, key, devices, sampling, start, first, tol, meter, kept)

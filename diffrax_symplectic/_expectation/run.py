@@ -27,7 +27,7 @@ from .estimate import (
     Moments,
     share_of_needed,
 )
-from .sampling import Samples, SamplingPlan
+from .sampling import MOST_SAMPLES, Samples, SamplingPlan
 
 
 NO_METER = diffrax.NoProgressMeter()
@@ -87,6 +87,11 @@ def run(
     begin = first if start is None else start.moments[0].begin
     next_sample = first if start is None else start.moments[-1].end
     end = begin + plan.num_samples
+    if end > MOST_SAMPLES:
+        raise ValueError(
+            f"Samples have numbers below 2^63; got {plan.num_samples} from number {begin} "
+            "on. Pass a smaller number of paths (or replicates), or a smaller `first`."
+        )
     batches = _Batches(plan, key, devices)
     no_moments = batches.moments_of_no_samples(next_sample, end)
     estimate = Expectation(

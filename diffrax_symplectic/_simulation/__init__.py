@@ -28,6 +28,7 @@ from .levels import (
     finer_change_weights,
     Level,
     level_weights,
+    MOST_LEVELS,
     with_next_level,
 )
 from .loop import (

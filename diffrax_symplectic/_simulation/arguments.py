@@ -13,7 +13,16 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from .._arguments import brief, check_real, check_takes, check_untraced, takes_args
+from .._arguments import (
+    brief,
+    check_args,
+    check_numbers,
+    check_real,
+    check_takes,
+    check_untraced,
+    is_numeric,
+    takes_args,
+)
 from .._brownian import (
     check_key,
     Discrete,
@@ -61,14 +70,20 @@ class StepNumbers(NamedTuple):
 
 def checked_key(caller: str, key: Any, others: Any) -> PRNGKeyArray:
     """The key that `caller` was called with, as a typed key. Raises a `ValueError` unless
-    it is a random key, and for traced arrays in it or in the other arguments."""
+    it is one random key, and for traced arrays in it or in the other arguments."""
     # Inside `jit` a new array is traced, too. Functions that close over traced values of
     # other transformations are found later, when a result that depends on these values is
     # read.
     new_array = jnp.zeros(())
     check_untraced(f"`{caller}`", (key, others, new_array))
     check_key(key, caller)
-    return typed_key(key)
+    key = typed_key(key)
+    if key.shape != ():
+        raise ValueError(
+            f"`{caller}` needs one random key, from which all paths get theirs; got keys "
+            f"of shape {key.shape}."
+        )
+    return key
 
 
 def step_numbers(
@@ -110,7 +125,9 @@ def step_numbers(
 
 
 def given_state(y0: Y) -> Y:
-    """The initial state in floating-point numbers."""
+    """The initial state in floating-point numbers. Raises a `ValueError` if it holds
+    anything else than numbers and arrays of numbers."""
+    check_numbers("y0", y0)
     return jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
 
 
@@ -137,6 +154,7 @@ def drawn_args(args_of: Callable, key: PRNGKeyArray) -> Args:
         )
         raise
 
+    check_args(args)
     # Each path has its own arrays of JAX. All paths share leaves that are no arrays.
     return jtu.tree_map(_with_jax_arrays, args)
 
@@ -242,9 +260,16 @@ def check_shapes(
 ) -> None:
     """Raises an error unless the terms fit the state, and `phi` takes this state and
     returns real arrays."""
-    check_terms_fit_state(terms, t0, y0, args)
     check_takes("phi", phi, "t", "y", "args")
-    result = _result_struct(phi, terms, t0, y0, args)
+    try:
+        check_terms_fit_state(terms, t0, y0, args)
+        result = _result_struct(phi, terms, t0, y0, args)
+    except TypeError as error:
+        # A function may compare words, but not compute with them.
+        kinds = {type(x).__name__ for x in jtu.tree_leaves(args) if not is_numeric(x)}
+        if kinds:
+            error.add_note(f"`args` hold no numbers, but {', '.join(sorted(kinds))}.")
+        raise
     check_real("phi", jtu.tree_leaves(result))
 
 

@@ -19,7 +19,14 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from .._arguments import check_solver, check_state, whole_number
+from .._arguments import (
+    check_args,
+    check_made_for_noise,
+    check_solver,
+    check_state,
+    check_terms,
+    whole_number,
+)
 from .._brownian import has_bounded_increments
 from .._compat import is_traced
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
@@ -51,7 +58,7 @@ from .arguments import (
     given_state,
     step_numbers,
 )
-from .levels import combinations, Level, level_weights, levels_of
+from .levels import combinations, Level, level_weights, levels_of, MOST_LEVELS
 
 
 # The number that is folded into the key of a sample to draw its `y0` and `args`. The words
@@ -119,12 +126,10 @@ class Problem(eqx.Module):
         """The problem of these arguments of `caller`, with a path of the solver in place of
         each shape in `terms`. `want` is the purpose of these paths. Raises a `ValueError`
         for bad arguments."""
-        levels = whole_number("levels", levels)
+        levels = whole_number("levels", levels, 1, MOST_LEVELS)
+        check_terms(terms)
         check_solver("solver", solver)
-        if isinstance(solver, diffrax.HalfSolver):
-            raise ValueError(
-                "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
-            )
+        check_made_for_noise(solver)
         # For each path in `terms`, whether the solver makes it.
         is_made_by_solver = which_are_shapes(terms)
         # The paths get keys for an example. In each sample others take their place.
@@ -136,6 +141,8 @@ class Problem(eqx.Module):
         args_of = args if callable(args) else None
         if args_of is not None:
             args = drawn_args(args_of, jr.key(0))
+        else:
+            check_args(args)
         y0_of = y0 if callable(y0) else None
         if y0_of is not None:
             y0 = drawn_state(y0_of, jr.key(1), args)
@@ -330,6 +337,11 @@ class Problem(eqx.Module):
     def dtype(self) -> Any:
         """The dtype of the state, which times and fits have, too."""
         return jnp.result_type(*jtu.tree_leaves(self.y0))
+
+    @property
+    def bytes_of_state(self) -> int:
+        """The memory that a state takes."""
+        return sum(leaf.nbytes for leaf in jtu.tree_leaves(self.y0))
 
     @property
     def output_shape(self) -> tuple[int, int]:

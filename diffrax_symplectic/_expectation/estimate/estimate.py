@@ -10,6 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
+from ..._arguments import is_real_number
 from ..._simulation import Combination
 from .error_bars import (
     is_off_order,
@@ -220,7 +221,16 @@ class Expectation(eqx.Module):
         """The ends of a confidence interval: `mean` plus and minus `error` times the
         quantile of Student's $t$ with `num_samples - 1` degrees of freedom. (For 95% this
         is 2.13 with 16 samples, and 1.96 with very many.) Where sampling is a small part of
-        `error` the interval holds the mean more often than that."""
+        `error` the interval holds the mean more often than that.
+
+        **Raises:** a `ValueError` unless `confidence` is a number between 0 and 1.
+        """
+        is_number = is_real_number(confidence) and np.ndim(confidence) == 0
+        if not (is_number and 0 < confidence < 1):
+            raise ValueError(
+                "`confidence` must be a number between 0 and 1, such as 0.95; got "
+                f"{confidence!r}."
+            )
         # SciPy is imported here, since it would double the time to import this package.
         from scipy.special import stdtrit
 
