@@ -18,9 +18,34 @@ from ._compat import is_traced
 from ._custom_types import Y
 
 
+_PACKAGE = os.path.dirname(__file__) + os.sep
 # Names of arguments that show that a function takes positions before momenta (or
 # velocities), where momenta come first.
 _POSITIONS_FIRST = (("x", "v"), ("x", "p"), ("q", "v"))
+
+
+class ShortTraceback:
+    """A context in which a `ValueError` that this package raises loses the frames between
+    the function that the user called and the check. Errors of the user's functions keep
+    theirs, and all errors do with `jax.config.update("jax_traceback_filtering", "off")`."""
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: Any, error: Any, traceback: Any) -> None:
+        if not isinstance(error, ValueError) or _shows_all_frames():
+            return
+        last = traceback
+        while last.tb_next is not None:
+            last = last.tb_next
+        if last.tb_frame.f_code.co_filename.startswith(_PACKAGE):
+            # The first is the function in which this context stands.
+            traceback.tb_next = None
+
+
+def _shows_all_frames() -> bool:
+    """Whether the user has switched off the filter of JAX."""
+    return jax.config.jax_traceback_filtering == "off"  # pyright: ignore
 
 
 def check_takes(name: str, fn: Any, *arguments: str) -> None:

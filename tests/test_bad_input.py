@@ -373,9 +373,11 @@ def _position(t, y, args):
     return y[1]
 
 
-TERMS = ds.hamiltonian_terms(
-    lambda t, p, q, args: p**2 / 2 - jnp.cos(q), lambda t, p, q, args: jnp.sin(q), ()
-)
+def _force(t, p, q, args):
+    return jnp.sin(q)
+
+
+TERMS = ds.hamiltonian_terms(lambda t, p, q, args: p**2 / 2 - jnp.cos(q), _force, ())
 DRAWN = ds.monte_carlo(jr.normal, key=jr.key(0), num_paths=16)
 
 
@@ -549,6 +551,31 @@ CALLS = [(message, call) for message, calls in REFUSED.items() for call in calls
 def test_a_wrong_call_is_told_what_to_pass(message, call):
     with pytest.raises(ValueError, match=message):
         call()
+
+
+def _frames(call) -> list[str]:
+    with pytest.raises(Exception) as info:
+        call()
+    return [entry.name for entry in info.traceback]
+
+
+@pytest.mark.parametrize("call, name", [(_mean, "expectation"), (_paths, "ensemble")])
+def test_only_the_function_that_was_called_stands_between_a_user_and_a_message(
+    call, name
+):
+    wrong = lambda: call(y0=jnp.ones(2))
+    assert _frames(wrong)[-2:] == [call.__name__, name]
+
+    def energy(t, p, q, args):
+        raise ValueError("of the user")
+
+    terms = ds.hamiltonian_terms(energy, _force, ())
+    assert _frames(lambda: call(terms=terms))[-1] == "energy"
+    try:
+        jax.config.update("jax_traceback_filtering", "off")
+        assert _frames(wrong)[-1] == "check_pair"
+    finally:
+        jax.config.update("jax_traceback_filtering", "auto")
 
 
 def test_words_in_args_may_be_compared_and_not_computed_with():

@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, PRNGKeyArray, PyTree
 
+from .._arguments import ShortTraceback
 from .._brownian import Discrete, laws_of, UnspecifiedPath
 from .._custom_types import Args, Devices, RealScalarLike, Y
 from .._simulation import (
@@ -194,7 +195,7 @@ def expectation(
     request = Request(not has_shape, key, sampling, tol, start, engine, devices)
     problem_of = ft.partial(Problem.of, phi, terms, solver, t0, t1, dt0, y0, args, ts)
     # The looks and trials after the last sample may be interrupted, too.
-    with Kept() as kept:
+    with ShortTraceback(), Kept() as kept:
         with Meter(progress_meter) as meter:
             while True:
                 problem, used_sampling, plan = choose(

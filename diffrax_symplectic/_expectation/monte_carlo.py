@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
-from .._arguments import check_real, check_takes, whole_number
+from .._arguments import check_real, check_takes, ShortTraceback, whole_number
 from .._compat import is_result
 from .._root_finder import all_finite
 from .._simulation import (
@@ -122,7 +122,7 @@ def monte_carlo(
     # A number on each level, or more.
     bytes_of_path = 4 * levels
     plan = sampling.plan(sampler, levels, devices, bytes_of_path)
-    with Kept() as kept:
+    with ShortTraceback(), Kept() as kept:
         with Meter(progress_meter) as meter:
             estimate = run(plan, key, devices, sampling, start, first, tol, meter, kept)
         advice = advice_on_failures(has_bounded_increments=False, is_implicit=False)

@@ -244,7 +244,7 @@ def test_equal_paths_are_one_brownian_motion():
         ("`num_paths` must be a power of two", dict(num_paths=1000)),
         ("`num_paths` must be an integer", dict(num_paths=1)),
         ("`replicates` must be an integer, 2 or larger", dict(replicates=1)),
-        ("`levels` must be a positive integer", dict(levels=0)),
+        ("`levels` must be an integer from 1 to 31", dict(levels=0)),
         ("Pass fewer levels", dict(levels=40)),
         ("`tol` must be a positive number", dict(tol=0.0)),
         ("`tol` must be a positive number", dict(tol="1e-3")),
