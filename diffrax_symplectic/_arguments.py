@@ -144,8 +144,8 @@ def check_terms(terms: Any) -> None:
     """Raises a `ValueError` unless this is a term."""
     if not isinstance(terms, diffrax.AbstractTerm):
         raise ValueError(
-            "`terms` must be a term of Diffrax, such as `hamiltonian_terms` returns; got a "
-            f"{type(terms).__name__}. Several terms are one as `diffrax.MultiTerm(*terms)`."
+            "`terms` must be Diffrax terms, such as `hamiltonian_terms(H0, noise, path)`, "
+            f"or several in a `diffrax.MultiTerm(*terms)`; got {type(terms).__name__}."
         )
 
 

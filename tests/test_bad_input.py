@@ -507,7 +507,7 @@ REFUSED = {
         lambda: _mean(lambda t, y, args: {"one": y[1], "none": jnp.zeros((2, 0))}),
         lambda: _drawn(lambda key: jr.normal(key, (0,))),
     ],
-    "`terms` must be a term of Diffrax.*Several terms are one as": [
+    "`terms` must be Diffrax terms.*several in a `diffrax.MultiTerm.*got": [
         call
         for terms in ([TERMS], (TERMS,), {"a": TERMS}, TERMS.terms, None)
         for call in (
