@@ -1,6 +1,10 @@
 """Checks of arguments: functions, numbers, solvers, states."""
 
 import inspect
+import math
+import os
+from collections.abc import Hashable, Iterator
+from traceback import extract_tb
 from typing import Any
 
 import diffrax
@@ -15,9 +19,31 @@ from ._compat import is_traced
 from ._custom_types import Y
 
 
+_PACKAGE = os.path.dirname(__file__) + os.sep
 # Names of arguments that show that a function takes positions before momenta (or
 # velocities), where momenta come first.
 _POSITIONS_FIRST = (("x", "v"), ("x", "p"), ("q", "v"))
+
+
+class ShortTraceback:
+    """A context in which a `ValueError` that this package raises loses the frames between
+    the function that the user called and the check. Errors of the user's functions keep
+    theirs, and all errors do with `jax.config.update("jax_traceback_filtering", "off")`."""
+
+    def __enter__(self) -> None:
+        return None
+
+    def __exit__(self, kind: Any, error: Any, traceback: Any) -> None:
+        if not isinstance(error, ValueError) or _shows_all_frames():
+            return
+        if extract_tb(traceback)[-1].filename.startswith(_PACKAGE):
+            # The first is the function in which this context stands.
+            traceback.tb_next = None
+
+
+def _shows_all_frames() -> bool:
+    """Whether the user has switched off the filter of JAX."""
+    return jax.config.jax_traceback_filtering == "off"  # pyright: ignore
 
 
 def check_takes(name: str, fn: Any, *arguments: str) -> None:
@@ -99,17 +125,97 @@ def check_solver(name: str, solver: Any) -> None:
     )
 
 
-def whole_number(name: str, value: Any, least: int = 1) -> int:
+def check_made_for_noise(solver: diffrax.AbstractSolver) -> None:
+    """Raises a `ValueError` for solvers of Diffrax that are for equations without noise, or
+    that wrap another one."""
+    kinds = diffrax.AbstractItoSolver | diffrax.AbstractStratonovichSolver
+    is_of_diffrax = type(solver).__module__.startswith("diffrax.")
+    # `isinstance` would look through a `diffrax.HalfSolver`.
+    if is_of_diffrax and not issubclass(type(solver), kinds):
+        raise ValueError(
+            "`solver` must take fixed steps and be for equations with noise, as those of "
+            f"`suggest_solver` are; got {solver!r}."
+        )
+
+
+def check_terms(terms: Any) -> None:
+    """Raises a `ValueError` unless this is a term."""
+    if not isinstance(terms, diffrax.AbstractTerm):
+        raise ValueError(
+            "`terms` must be Diffrax terms, such as `hamiltonian_terms(H0, noise, path)`, "
+            f"or several in a `diffrax.MultiTerm(*terms)`; got {type(terms).__name__}."
+        )
+
+
+def check_args(args: Any) -> None:
+    """Raises a `ValueError` for `args` of which no program can be compiled."""
+    for leaf in jtu.tree_leaves(args):
+        # Words and functions may be compared and called.
+        is_constant = isinstance(leaf, Hashable) and not isinstance(leaf, Iterator)
+        if not (is_numeric(leaf) or (is_constant and not eqx.is_array_like(leaf))):
+            raise ValueError(
+                "`args` must hold arrays, in tuples, lists and dictionaries, or in an "
+                f"`equinox.Module`; got a {type(leaf).__name__}, {leaf!r}."
+            )
+
+
+def check_numbers(name: str, tree: PyTree) -> None:
+    """Raises a `ValueError` if the argument of this name, a PyTree, holds anything else
+    than numbers and arrays of numbers."""
+    for leaf in jtu.tree_leaves(tree):
+        if not is_numeric(leaf):
+            raise ValueError(
+                f"`{name}` must hold numbers and arrays of numbers, in tuples, lists and "
+                f"dictionaries; got a {type(leaf).__name__}, {leaf!r}."
+            )
+
+
+def is_numeric(leaf: Any) -> bool:
+    """Whether JAX takes this for an array."""
+    has_objects = getattr(leaf, "dtype", np.dtype(float)).kind in "OSUMm"
+    return eqx.is_array_like(leaf) and not has_objects
+
+
+def whole_number(name: str, value: Any, least: int = 1, most: int | None = None) -> int:
     """The value of the argument of this name, as an integer of Python. Raises a
-    `ValueError` unless it is an integer, `least` or larger."""
+    `ValueError` unless it is an integer, from `least` to `most`."""
     # `True` is an integer to Python.
     is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    if not is_integer or value < least:
+    if not is_integer or value < least or (most is not None and value > most):
         expected = "a positive integer"
-        if least != 1:
+        if most is not None:
+            expected = f"an integer from {least} to {most}"
+        elif least != 1:
             expected = f"an integer, {least} or larger"
         raise ValueError(f"`{name}` must be {expected}; got {value!r}.")
     return int(value)
+
+
+def check_memory(
+    name: str, number: int, bytes_of_each: int, device: Any = None
+) -> None:
+    """Raises a `ValueError` if the argument of this name asks for more paths at once than
+    fit the memory of a device, by default of this machine. `bytes_of_each` is the least
+    that a path takes."""
+    needed = number * bytes_of_each
+    memory = _memory_of(device)
+    if needed > memory:
+        raise ValueError(
+            f"`{name}={number}`: so many paths take {needed / 1e9:,.0f} GB or more, of "
+            f"{memory / 1e9:,.0f} GB. Pass a smaller `{name}`."
+        )
+
+
+def _memory_of(device: Any) -> float:
+    """The memory of a device in bytes, or infinity if that is not known."""
+    if device is not None and device.platform != "cpu":
+        statistics = device.memory_stats() or {}
+        return statistics.get("bytes_limit", math.inf)
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError):
+        # Not every system says it.
+        return math.inf
 
 
 def check_real(name: str, leaves: list) -> None:
@@ -117,6 +223,11 @@ def check_real(name: str, leaves: list) -> None:
     real: one or more arrays, numbers or structs of arrays."""
     if len(leaves) == 0:
         raise ValueError(f"`{name}` must return real arrays; it returned none.")
+    if any(np.size(leaf) == 0 for leaf in leaves if hasattr(leaf, "shape")):
+        raise ValueError(
+            f"`{name}` must return arrays with one entry or more; got shapes "
+            f"{[jnp.shape(leaf) for leaf in leaves]}."
+        )
     dtypes = [getattr(leaf, "dtype", type(leaf)) for leaf in leaves]
     if not all(_is_real(dtype) for dtype in dtypes):
         raise ValueError(
@@ -192,6 +303,7 @@ def check_state(caller: str, y0: Y) -> None:
     leaves = jtu.tree_leaves(y0)
     if len(leaves) == 0:
         raise ValueError(f"`{caller}` needs a state with at least one array.")
+    check_numbers("y0", y0)
     for leaf in leaves:
         dtype = jnp.result_type(leaf)
         if jnp.issubdtype(dtype, jnp.complexfloating):

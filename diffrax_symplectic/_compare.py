@@ -17,10 +17,19 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree
 
-from ._arguments import check_real, check_solver, check_takes, check_untraced, shapes
+from ._arguments import (
+    check_memory,
+    check_real,
+    check_solver,
+    check_takes,
+    check_untraced,
+    shapes,
+    whole_number,
+)
 from ._custom_types import Args, RealScalarLike, Y
 from ._lapack import lapack_in_turn
 from ._programs import traced
+from ._simulation import checked_key
 from ._solver import common_path, own_path
 from ._suggest import suggest_solver
 from ._terms import (
@@ -201,10 +210,14 @@ def compare_solvers(
     multiple of the smallest, if `phi` does not return one number, or if a solver is not a
     Diffrax solver.
     """
+    key = checked_key("compare_solvers", key, (terms, y0, args))
+    num_paths = whole_number("num_paths", num_paths, 2)
     dts = _checked_dts(t0, t1, dt0)
     want = "strong" if phi is None else "weak"
     terms = shapes_as_paths(terms)
     suggestions = suggest_solver(terms, t0, y0, args, want=want)
+    bytes_of_state = sum(jnp.asarray(leaf).nbytes for leaf in jtu.tree_leaves(y0))
+    check_memory("num_paths", num_paths, bytes_of_state)
     reference = suggestions[0].solver if reference is None else reference
     if solvers is None:
         solvers = [s.solver for s in suggestions]
@@ -395,8 +408,12 @@ def _mean_and_std_error(values: Any, okay: Any) -> tuple[float, float]:
 
 def _check_solvers(solvers: Any, reference: Any) -> None:
     """Raises a `ValueError` unless these are a list of solvers, and a solver."""
-    if not isinstance(solvers, Sequence) or isinstance(solvers, str):
-        raise ValueError(f"`solvers` must be a list of solvers; got {solvers!r}.")
+    is_list = isinstance(solvers, Sequence) and not isinstance(solvers, str)
+    if not is_list or len(solvers) == 0:
+        raise ValueError(
+            "`solvers` must be a list of one or more solvers, or `None` for the suggested "
+            f"ones; got {solvers!r}."
+        )
     for solver in solvers:
         check_solver("solvers", solver)
     check_solver("reference", reference)

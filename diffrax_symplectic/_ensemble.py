@@ -12,7 +12,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree
 
-from ._arguments import brief, whole_number
+from ._arguments import brief, check_memory, ShortTraceback, whole_number
 from ._compat import is_traced
 from ._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from ._fused import sample_key
@@ -179,24 +179,27 @@ def ensemble(
         raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
-    problem = Problem.of(
-        state_itself,
-        terms,
-        solver,
-        t0,
-        t1,
-        dt0,
-        y0,
-        args,
-        ts=[t1] if ts is None else ts,
-        levels=1,
-        want=want,
-        caller="ensemble",
-        key=key,
-    )
+    with ShortTraceback():
+        problem = Problem.of(
+            state_itself,
+            terms,
+            solver,
+            t0,
+            t1,
+            dt0,
+            y0,
+            args,
+            ts=[t1] if ts is None else ts,
+            levels=1,
+            want=want,
+            caller="ensemble",
+            key=key,
+        )
     if want == "strong" and any(which_are_shapes(terms)):
         check_gaussian(solver)
     warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
+    num_times = problem.levels.saved_steps.size
+    check_memory("num_paths", num_paths, num_times * problem.bytes_of_state)
     if batch_size is None:
         batch_size = _default_batch_size(engine, problem)
     batch_size = min(whole_number("batch_size", batch_size), num_paths)

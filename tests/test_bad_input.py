@@ -1,5 +1,6 @@
 """Terms and states that do not fit get an error that says what to pass instead."""
 
+import dataclasses
 from typing import NamedTuple
 
 import diffrax
@@ -366,3 +367,228 @@ def test_matrices_for_a_state_of_several_arrays_become_an_operator():
     y0 = (jnp.zeros(3), jnp.ones(3))
     with pytest.raises(ValueError, match="must be a Lineax operator"):
         _solve(diffrax.MultiTerm(drift, noise), y0)
+
+
+def _position(t, y, args):
+    return y[1]
+
+
+def _force(t, p, q, args):
+    return jnp.sin(q)
+
+
+TERMS = ds.hamiltonian_terms(lambda t, p, q, args: p**2 / 2 - jnp.cos(q), _force, ())
+DRAWN = ds.monte_carlo(jr.normal, key=jr.key(0), num_paths=16)
+
+
+def _mean(phi=_position, **others):
+    arguments = dict(
+        terms=TERMS,
+        solver=ds.StormerVerlet(),
+        t0=0,
+        t1=1,
+        dt0=0.5,
+        y0=(0.0, 1.0),
+        key=jr.key(0),
+        sampling=ds.IndependentPaths(16),
+    )
+    return ds.expectation(phi, **(arguments | others))
+
+
+def _paths(**others):
+    arguments = dict(
+        terms=TERMS,
+        solver=ds.StormerVerlet(),
+        t0=0,
+        t1=1,
+        dt0=0.5,
+        y0=(0.0, 1.0),
+        key=jr.key(0),
+        num_paths=4,
+    )
+    return ds.ensemble(**(arguments | others))
+
+
+def _drawn(fn=jr.normal, **others):
+    return ds.monte_carlo(fn, **(dict(key=jr.key(0), num_paths=16) | others))
+
+
+def _compared(**others):
+    arguments = dict(
+        terms=TERMS,
+        solvers=[ds.StormerVerlet()],
+        t0=0,
+        t1=1,
+        dt0=[0.5],
+        y0=(0.0, 1.0),
+        key=jr.key(0),
+        num_paths=4,
+    )
+    return ds.compare_solvers(**(arguments | others))
+
+
+@dataclasses.dataclass
+class _Parameters:
+    stiffness: float = 1.0
+
+
+def _generator():
+    yield 1.0
+
+
+DEVICE = jax.devices()[0]
+TWO_KEYS = jr.split(jr.key(0), 2)
+OLD_KEYS = jr.split(jr.PRNGKey(0), 2)
+HUGE = 10**12
+# From a message to calls that are answered by it. None of them compiles a program.
+REFUSED = {
+    "`confidence` must be a number between 0 and 1, such as 0.95": [
+        lambda: DRAWN.interval(95),
+        lambda: DRAWN.interval(0),
+        lambda: DRAWN.interval(float("nan")),
+        lambda: DRAWN.interval("0.95"),  # pyright: ignore
+        lambda: DRAWN.interval(None),  # pyright: ignore
+        lambda: DRAWN.interval(np.array([0.5, 0.9])),  # pyright: ignore
+    ],
+    "`tol` must be a positive number": [
+        lambda: _mean(tol=True),
+        lambda: _mean(tol=1e-320),
+        lambda: _drawn(tol=jnp.ones(2)),
+    ],
+    "`devices` must be a list of one or more devices": [
+        lambda: _drawn(devices=[]),
+        lambda: _mean(devices=DEVICE),
+    ],
+    "`devices` must differ": [lambda: _drawn(devices=[DEVICE, DEVICE])],
+    "`(expectation|ensemble|monte_carlo|compare_solvers)` needs one random key": [
+        call
+        for keys in (TWO_KEYS, OLD_KEYS)
+        for call in (
+            lambda: _mean(key=keys),
+            lambda: _paths(key=keys),
+            lambda: _drawn(key=keys),
+            lambda: _compared(key=keys),
+        )
+    ],
+    "`compare_solvers` needs a random key": [
+        lambda: _compared(key=0),
+        lambda: _compared(key=None),
+    ],
+    "`first` must be an integer from 0 to": [
+        lambda: _drawn(first=2**64),
+        lambda: _mean(first=2**63),
+    ],
+    "Samples have numbers below 2": [
+        lambda: _drawn(first=2**63 - 8),
+        lambda: _drawn(num_paths=2**70),
+    ],
+    "`levels` must be an integer from 1 to": [
+        lambda: _mean(levels=2000),
+        lambda: _drawn(levels=2000, order=1),
+    ],
+    "paths take .* GB or more, of .* GB. Pass a smaller `batch_size`": [
+        lambda: _mean(sampling=ds.IndependentPaths(64, HUGE)),
+        lambda: _mean(sampling=ds.ValueFunctions(1, 64, HUGE)),
+        lambda: _drawn(num_paths=HUGE, batch_size=HUGE),
+    ],
+    "paths take .* GB or more, of .* GB. Pass a smaller `num_paths`": [
+        lambda: _mean(sampling=ds.ArrayRQMC(2**40)),
+        lambda: _paths(num_paths=HUGE),
+        lambda: _paths(num_paths=10**9, ts=np.linspace(0.5, 5000, 10_000), t1=5000),
+        lambda: _compared(num_paths=HUGE),
+    ],
+    "`num_paths` must be an integer, 2 or larger": [
+        lambda: _compared(num_paths=0),
+        lambda: _compared(num_paths=1.5),
+        lambda: _compared(num_paths="many"),
+    ],
+    "must return arrays with one entry or more": [
+        lambda: _mean(lambda t, y, args: jnp.zeros(0)),
+        lambda: _mean(lambda t, y, args: {"one": y[1], "none": jnp.zeros((2, 0))}),
+        lambda: _drawn(lambda key: jr.normal(key, (0,))),
+    ],
+    "`terms` must be Diffrax terms.*several in a `diffrax.MultiTerm.*got": [
+        call
+        for terms in ([TERMS], (TERMS,), {"a": TERMS}, TERMS.terms, None)
+        for call in (
+            lambda terms=terms: _mean(terms=terms),
+            lambda terms=terms: _paths(terms=terms),
+        )
+    ],
+    "`solver` must take fixed steps and be for equations with noise": [
+        lambda: _mean(solver=diffrax.Tsit5()),
+        lambda: _paths(solver=diffrax.Kvaerno3()),
+        lambda: _mean(solver=diffrax.HalfSolver(ds.StormerVerlet())),
+    ],
+    "`solvers` must be a list of one or more solvers": [
+        lambda: _compared(solvers=[]),
+        lambda: _compared(solvers=ds.StormerVerlet()),
+        lambda: _compared(solvers="StormerVerlet"),
+    ],
+    "`y0` must hold numbers and arrays of numbers.*got a": [
+        call
+        for y0 in ("rest", ("a", "b"), {0.0, 1.0}, _Parameters(), _generator())
+        for call in (
+            lambda y0=y0: _mean(y0=y0),
+            lambda y0=y0: _paths(y0=lambda key: y0),
+            lambda y0=y0: _compared(y0=y0),
+            lambda y0=y0: ds.suggest_solver(TERMS, 0.0, y0, want="weak"),
+        )
+    ],
+    "`args` must hold arrays.*got a": [
+        call
+        for args in ({1.0}, (1.0, {2}), _Parameters(), _generator(), np.array(["a"]))
+        for call in (
+            lambda args=args: _mean(args=args),
+            lambda args=args: _paths(args=lambda key: args),
+        )
+    ],
+}
+CALLS = [(message, call) for message, calls in REFUSED.items() for call in calls]
+
+
+@pytest.mark.parametrize("message, call", CALLS)
+def test_a_wrong_call_is_told_what_to_pass(message, call):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def _frames(call) -> list[str]:
+    with pytest.raises(Exception) as info:
+        call()
+    return [entry.name for entry in info.traceback]
+
+
+@pytest.mark.parametrize("call, name", [(_mean, "expectation"), (_paths, "ensemble")])
+def test_only_the_function_that_was_called_stands_between_a_user_and_a_message(
+    call, name
+):
+    wrong = lambda: call(y0=jnp.ones(2))
+    assert _frames(wrong)[-2:] == [call.__name__, name]
+
+    def energy(t, p, q, args):
+        raise ValueError("of the user")
+
+    terms = ds.hamiltonian_terms(energy, _force, ())
+    assert _frames(lambda: call(terms=terms))[-1] == "energy"
+    try:
+        jax.config.update("jax_traceback_filtering", "off")
+        assert _frames(wrong)[-1] == "check_pair"
+    finally:
+        jax.config.update("jax_traceback_filtering", "auto")
+
+
+def test_words_in_args_may_be_compared_and_not_computed_with():
+    def energy(t, p, q, args):
+        return p**2 / 2 + (q**2 if args["kind"] == "soft" else args["kind"] * q)
+
+    terms = ds.hamiltonian_terms(energy, lambda t, p, q, args: -q, ())
+    assert _paths(terms=terms, args={"kind": "soft"}).num_failed == 0
+    with pytest.raises(TypeError) as info:
+        _paths(terms=terms, args={"kind": "stiff"})
+    assert "`args` hold no numbers, but str." in info.value.__notes__
+
+
+def test_a_tolerance_whose_square_underflows_is_told_as_any_other():
+    with pytest.warns(UserWarning, match="`tol=1e-300` was not reached"):
+        _drawn(tol=1e-300)

@@ -7,10 +7,11 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from .._arguments import whole_number
+from .._arguments import is_real_number, whole_number
 from .._custom_types import Devices
 from .._simulation import checked_key
 from .estimate import Expectation
+from .sampling import MOST_SAMPLES
 
 
 class CheckedCall(NamedTuple):
@@ -43,19 +44,22 @@ def checked_call(
         raise ValueError(
             "Pass either `start`, which continues after its last sample, or `first`."
         )
-    first = whole_number("first", first, 0)
-    is_number = isinstance(tol, int | float | np.number)
-    if tol is not None and not (is_number and 0 < tol < np.inf):
+    first = whole_number("first", first, 0, MOST_SAMPLES - 1)
+    is_number = is_real_number(tol) and np.ndim(tol) == 0
+    # Smaller numbers have fewer digits.
+    if tol is not None and not (is_number and np.finfo(float).tiny <= tol < np.inf):
         raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")
     if start is not None and not isinstance(start, Expectation):
         raise ValueError(
             f"`start` must be what `{function_name}` returned, or `None`; got {start!r}."
         )
     devices = jax.devices() if devices is None else devices
-    is_sequence = isinstance(devices, Sequence)
+    is_sequence = isinstance(devices, Sequence) and len(devices) > 0
     if not is_sequence or not all(isinstance(x, jax.Device) for x in devices):
         raise ValueError(
-            "`devices` must be a list of devices, such as `jax.devices()[:1]`, or `None`; "
-            f"got {devices!r}."
+            "`devices` must be a list of one or more devices, such as `jax.devices()[:1]`, "
+            f"or `None`; got {devices!r}."
         )
+    if len(set(devices)) < len(devices):
+        raise ValueError(f"`devices` must differ; got {devices!r}.")
     return CheckedCall(key, first, tuple(devices))

@@ -11,6 +11,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, PRNGKeyArray, PyTree
 
+from .._arguments import ShortTraceback
 from .._brownian import Discrete, laws_of, UnspecifiedPath
 from .._custom_types import Args, Devices, RealScalarLike, Y
 from .._simulation import (
@@ -33,7 +34,6 @@ from .choose import choose, Request, trial_key, trial_sampling
 from .estimate import (
     cautions,
     Expectation,
-    ExpectationInterrupted,
     largest_error,
     needs_level,
 )
@@ -44,7 +44,7 @@ from .jumps import jumps_at_step_ends, jumps_within_steps
 from .kinks import has_kinks
 from .long_steps import may_be_too_long, too_long_steps, unresolved_noise
 from .out_of_range import out_of_range
-from .run import Meter, NO_METER, run
+from .run import Kept, Meter, NO_METER, run
 from .sampling import AbstractSampling
 from .strong_friction import unresolved_friction
 
@@ -166,7 +166,7 @@ def expectation(
     other shapes or more paths, terms without noise, and for paths that `sampling` cannot
     use (the message names suitable ones); a
     [`diffrax_symplectic.ExpectationInterrupted`][] holding the estimate so far, on a
-    keyboard interrupt.
+    keyboard interrupt after the first batch.
 
     Warns of the error bar: if `tol` was not reached, if failed paths could change the mean
     by more than the standard error, if a few samples account for most of the variance, if
@@ -199,49 +199,49 @@ def expectation(
     problem_of = ft.partial(
         Problem.of, phi, terms, solver, t0, t1, dt0, y0, args, ts, key=key
     )
-    with Meter(progress_meter) as meter:
-        while True:
-            try:
-                decision = choose(ft.partial(problem_of, levels), request)
-            except ExpectationInterrupted:
-                # Trial samples are not part of the estimate, and cannot be continued.
-                raise KeyboardInterrupt from None
-            problem, used_sampling, plan = decision
-            times = None if ts is None else np.array(ts, float).reshape(-1)
-            estimate = run(
-                plan, key, devices, used_sampling, start, first, tol, meter, times
-            )
-            if tol is None or not may_add_levels or levels == _MOST_LEVELS:
-                break
-            if not needs_level(estimate, tol):
-                break
-            levels += 1
+    times = None if ts is None else np.array(ts, float).reshape(-1)
+    # The looks and trials after the last sample may be interrupted, too.
+    with ShortTraceback(), Kept() as kept:
+        with Meter(progress_meter) as meter:
+            while True:
+                problem, used_sampling, plan = choose(
+                    ft.partial(problem_of, levels), request
+                )
+                estimate = run(
+                    plan, key, devices, used_sampling, start, first, tol, meter, times,
+                    kept,
+                )  # fmt: skip
+                if tol is None or not may_add_levels or levels == _MOST_LEVELS:
+                    break
+                if not needs_level(estimate, tol):
+                    break
+                levels += 1
 
-    advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
-    # `num_paths` are those that did not fail.
-    most_fail = estimate.num_failed > estimate.num_paths
-    lost_numbers = out_of_range(problem, most_fail)
-    if lost_numbers is not None and most_fail:
-        advice = lost_numbers
-    elif lost_numbers is not None:
-        warnings.warn(lost_numbers, stacklevel=2)
-    elif most_fail and may_be_too_long(problem):
-        advice = (
-            f"Most likely, steps of `dt0={float(dt0):g}` are too long for "
-            f"`{type(solver).__name__}`: pass `dt0={float(dt0) / 4:g}` or less, or an "
-            f"implicit solver. {advice}"
-        )
-    for message in cautions(estimate, tol, advice):
-        warnings.warn(message, stacklevel=2)
-    paths = plan.simulate_paths
-    if isinstance(paths, FusedPaths):
-        warn_of_stragglers(
-            paths.num_stragglers, paths.num_failed, paths.num_paths, stacklevel=2
-        )
-    _warn_of_rounding(estimate, problem)
-    # Warnings of the problem come with its first samples, and not again with later parts.
-    if start is None and first == 0:
-        try:
+        advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
+        # `num_paths` are those that did not fail.
+        most_fail = estimate.num_failed > estimate.num_paths
+        lost_numbers = out_of_range(problem, most_fail)
+        if lost_numbers is not None and most_fail:
+            advice = lost_numbers
+        elif lost_numbers is not None:
+            warnings.warn(lost_numbers, stacklevel=2)
+        elif most_fail and may_be_too_long(problem):
+            advice = (
+                f"Most likely, steps of `dt0={float(dt0):g}` are too long for "
+                f"`{type(solver).__name__}`: pass `dt0={float(dt0) / 4:g}` or less, or an "
+                f"implicit solver. {advice}"
+            )
+        for message in cautions(estimate, tol, advice):
+            warnings.warn(message, stacklevel=2)
+        paths = plan.simulate_paths
+        if isinstance(paths, FusedPaths):
+            warn_of_stragglers(
+                paths.num_stragglers, paths.num_failed, paths.num_paths, stacklevel=2
+            )
+        _warn_of_rounding(estimate, problem)
+        # Warnings of the problem come with its first samples, and not again with later
+        # parts.
+        if start is None and first == 0:
             messages = _messages_on_steps(estimate, problem, float(dt0))
             # A trial takes longer than these looks, which name the cause.
             if estimate.levels == 2 and not messages:
@@ -252,12 +252,9 @@ def expectation(
                 messages += [] if trial.message is None else [trial.message]
             if has_kinks(problem):
                 messages += _messages_on_law(estimate, problem, key, devices)
-        except ExpectationInterrupted:
-            # What was interrupted is a trial, and its estimate is not that of the call.
-            raise ExpectationInterrupted(estimate) from None
-        for message in messages:
-            warnings.warn(message, stacklevel=2)
-        warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
+            for message in messages:
+                warnings.warn(message, stacklevel=2)
+            warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
     return estimate
 
 

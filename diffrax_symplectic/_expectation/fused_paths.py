@@ -36,8 +36,12 @@ def fused_plan(
             f'`engine="drjit"` uses all cores, or one GPU; got {len(devices)} devices. '
             "Pass `devices=jax.devices()[:1]`."
         )
-    levels = len(problem.levels.h)
-    plan = sampling.plan(jtu.Partial(_samples_of_fused_paths, problem), levels, devices)
+    plan = sampling.plan(
+        jtu.Partial(_samples_of_fused_paths, problem),
+        len(problem.levels.h),
+        devices,
+        problem.bytes_of_state,
+    )
     if sampling.batch_size is None:
         plan = plan._replace(batch_size=_FUSED_BATCH)
     return plan._replace(simulate_paths=FusedPaths(problem, key))

@@ -8,7 +8,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Key
 
-from .._arguments import whole_number
+from .._arguments import check_memory, whole_number
 from .._custom_types import Devices
 from .._simulation import Problem, values_of_paths
 from .sampling import AbstractSampling, Averaged, Samples, SamplingPlan, saved_by_name
@@ -42,19 +42,27 @@ class IndependentPaths(AbstractSampling):
     batch_size: int | np.integer | None = None
 
     def prepare(self, problem, key, devices):
-        levels = len(problem.levels.h)
         return self.plan(
-            jtu.Partial(_samples_of_independent_paths, problem), levels, devices
+            jtu.Partial(_samples_of_independent_paths, problem),
+            len(problem.levels.h),
+            devices,
+            problem.bytes_of_state,
         )
 
     def plan(
-        self, sampler: Callable[..., Samples], levels: int, devices: Devices
+        self,
+        sampler: Callable[..., Samples],
+        levels: int,
+        devices: Devices,
+        bytes_of_path: int,
     ) -> SamplingPlan:
-        """The plan for a `sampler`, any function that makes a sample for each key."""
+        """The plan for a `sampler`, any function that makes a sample for each key.
+        `bytes_of_path` is the least memory that a path takes."""
         if self.batch_size is None:
             size = _BATCH_ON_CPU if devices[0].platform == "cpu" else _BATCH_ELSEWHERE
         else:
             size = whole_number("batch_size", self.batch_size)
+            check_memory("batch_size", size, bytes_of_path, devices[0])
         return SamplingPlan(
             sampler, num_samples=self.num_paths, batch_size=size, levels=levels
         )

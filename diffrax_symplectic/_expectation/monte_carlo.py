@@ -11,15 +11,26 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
-from .._arguments import check_real, check_takes, check_untraced, whole_number
+from .._arguments import (
+    check_real,
+    check_takes,
+    check_untraced,
+    ShortTraceback,
+    whole_number,
+)
 from .._compat import is_result
 from .._programs import current_traces, digest, Traced, traced
 from .._root_finder import all_finite
-from .._simulation import advice_on_failures, combinations, level_weights
+from .._simulation import (
+    advice_on_failures,
+    combinations,
+    level_weights,
+    MOST_LEVELS,
+)
 from .call import checked_call
 from .estimate import cautions, Expectation
 from .independent import IndependentPaths
-from .run import Meter, NO_METER, run
+from .run import Kept, Meter, NO_METER, run
 from .sampling import Averaged, Samples
 
 
@@ -99,7 +110,7 @@ def monte_carlo(
     equal, as they are if `fn` does not use its key.
     """
     key, first, devices = checked_call("monte_carlo", key, tol, start, first, devices)
-    levels = whole_number("levels", levels)
+    levels = whole_number("levels", levels, 1, MOST_LEVELS)
     if levels > 1 and order is None:
         raise ValueError(
             "Several `levels` need `order=`, the weak order of the solver; got "
@@ -114,23 +125,27 @@ def monte_carlo(
         raise ValueError(f"`order` must be a positive integer, or 1/2; got {order!r}.")
     sampling = IndependentPaths(num_paths, batch_size)
     weights = level_weights(float(order or 1), levels)
-    # A level is a Python integer, by which a function may choose its step, so each level is
-    # a program of its own.
-    with current_traces(fn):
-        programs = [
-            traced(jtu.Partial(_value_and_success, fn, level), key, identity=fn)
-            for level in ([()] if levels == 1 else [(k,) for k in range(levels)])
-        ]
-    check_untraced("`monte_carlo`", programs)
-    plan = sampling.plan(
-        jtu.Partial(_samples_of_programs, programs, weights), levels, devices
-    )
-    plan = plan._replace(digests=dict(fn=digest(programs), order=digest(order)))
-    with Meter(progress_meter) as meter:
-        estimate = run(plan, key, devices, sampling, start, first, tol, meter)
-    advice = advice_on_failures(has_bounded_increments=False, is_implicit=False)
-    for message in cautions(estimate, tol, advice):
-        warnings.warn(message, stacklevel=2)
+    with ShortTraceback(), Kept() as kept:
+        # A level is a Python integer, by which a function may choose its step, so each
+        # level is a program of its own.
+        with current_traces(fn):
+            programs = [
+                traced(jtu.Partial(_value_and_success, fn, level), key, identity=fn)
+                for level in ([()] if levels == 1 else [(k,) for k in range(levels)])
+            ]
+        check_untraced("`monte_carlo`", programs)
+        sampler = jtu.Partial(_samples_of_programs, programs, weights)
+        # A number on each level, or more.
+        bytes_of_path = 4 * levels
+        plan = sampling.plan(sampler, levels, devices, bytes_of_path)
+        plan = plan._replace(digests=dict(fn=digest(programs), order=digest(order)))
+        with Meter(progress_meter) as meter:
+            estimate = run(
+                plan, key, devices, sampling, start, first, tol, meter, kept=kept
+            )
+        advice = advice_on_failures(has_bounded_increments=False, is_implicit=False)
+        for message in cautions(estimate, tol, advice):
+            warnings.warn(message, stacklevel=2)
     return estimate
 
 

@@ -27,7 +27,7 @@ from .estimate import (
     Moments,
     share_of_needed,
 )
-from .sampling import Samples, SamplingPlan
+from .sampling import MOST_SAMPLES, Samples, SamplingPlan
 
 
 NO_METER = diffrax.NoProgressMeter()
@@ -51,6 +51,23 @@ class Meter:
         self._meter.close(self._state)
 
 
+class Kept:
+    """Keeps the estimate so far. As a context manager it raises an `ExpectationInterrupted`
+    that holds it, in place of a `KeyboardInterrupt` anywhere within.
+
+    - `estimate`: the estimate after the last batch; `None` before the first.
+    """
+
+    estimate: Expectation | None = None
+
+    def __enter__(self) -> "Kept":
+        return self
+
+    def __exit__(self, kind: Any, error: Any, traceback: Any) -> None:
+        if isinstance(error, KeyboardInterrupt) and self.estimate is not None:
+            raise ExpectationInterrupted(self.estimate) from None
+
+
 def run(
     plan: SamplingPlan,
     key: PRNGKeyArray,
@@ -61,15 +78,21 @@ def run(
     tol: float | None = None,
     meter: Meter | None = None,
     ts: np.ndarray | None = None,
+    kept: Kept | None = None,
 ) -> Expectation:
     """The estimate from the samples of a plan, which continues `start`, or without it
     begins with sample number `first`. With a tolerance `tol` it may end before all samples
     of the plan. The result does not depend on the number of devices. `ts` is that of
-    `Expectation`."""
+    `Expectation`. `kept` gets the estimate after each batch; trials have none."""
     # The first sample of all, and the first that is not in `start`.
     begin = first if start is None else start.moments[0].begin
     next_sample = first if start is None else start.moments[-1].end
     end = begin + plan.num_samples
+    if end > MOST_SAMPLES:
+        raise ValueError(
+            f"Samples have numbers below 2^63; got {plan.num_samples} from number {begin} "
+            "on. Pass a smaller number of paths (or replicates), or a smaller `first`."
+        )
     batches = _Batches(plan, key, devices)
     no_moments = batches.moments_of_no_samples(next_sample, end)
     estimate = Expectation(
@@ -79,10 +102,12 @@ def run(
         rounding_floor=plan.rounding_floor,
         sampling=sampling,
         reason=plan.reason,
+        tol_reached=None if tol is None else False,
         tails=plan.tails,
         digests=plan.digests,
         ts=ts,
     )
+    kept = Kept() if kept is None else kept
     if start is not None:
         check_same(start, estimate, "`start`")
         if next_sample > end:
@@ -92,6 +117,7 @@ def run(
                 "number."
             )
         estimate = dataclasses.replace(estimate, moments=start.moments)
+        kept.estimate = estimate
 
     def needs_no_more_samples() -> bool:
         return _needs_no_more_samples(estimate, plan.least_samples, tol)
@@ -99,36 +125,35 @@ def run(
     running_batches: collections.deque[BatchMoments] = collections.deque()
     # One past the last sample of the batches that were started.
     end_of_started = next_sample
-    try:
-        while True:
-            starts_batch = end_of_started < end and not needs_no_more_samples()
-            if starts_batch:
-                sampler = batches.sampler_at(end_of_started)
-                running_batches.append(batches.start(end_of_started, end, sampler))
-                end_of_started += batches.size * len(devices)
-            # While the batch just started is being computed, the one before is added up.
-            has_previous = len(running_batches) > (1 if starts_batch else 0)
-            if has_previous:
-                for device_moments in batches.moments_of_devices(
-                    running_batches.popleft()
-                ):
-                    # The moments of each device are a batch of their own: where to stop
-                    # does not depend on how many devices there are.
-                    if _end_of(estimate) == end or needs_no_more_samples():
-                        break
-                    estimate = _with_batch(
-                        estimate, device_moments, batches.size, end, no_moments.dtypes
-                    )
-                if meter is not None:
-                    share = (_end_of(estimate) - begin) / plan.num_samples
-                    meter.step(max(share, share_of_needed(estimate, tol)))
-            elif not starts_batch:
-                break
-    except KeyboardInterrupt:
-        raise ExpectationInterrupted(
-            _with_tol_reached(estimate, plan.least_samples, tol)
-        ) from None
-    return _with_tol_reached(estimate, plan.least_samples, tol)
+    while True:
+        starts_batch = end_of_started < end and not needs_no_more_samples()
+        if starts_batch:
+            sampler = batches.sampler_at(end_of_started)
+            running_batches.append(batches.start(end_of_started, end, sampler))
+            end_of_started += batches.size * len(devices)
+        # While the batch just started is being computed, the one before is added up.
+        has_previous = len(running_batches) > (1 if starts_batch else 0)
+        if has_previous:
+            for device_moments in batches.moments_of_devices(running_batches.popleft()):
+                # The moments of each device are a batch of their own: where to stop
+                # does not depend on how many devices there are.
+                if _end_of(estimate) == end or needs_no_more_samples():
+                    break
+                estimate = _with_batch(
+                    estimate, device_moments, batches.size, end, no_moments.dtypes
+                )
+                kept.estimate = estimate
+            if meter is not None:
+                share = (_end_of(estimate) - begin) / plan.num_samples
+                meter.step(max(share, share_of_needed(estimate, tol)))
+        elif not starts_batch:
+            break
+    if tol is not None:
+        has_enough = estimate.num_samples >= plan.least_samples
+        tol_reached = has_enough and is_reached(estimate, tol)
+        estimate = dataclasses.replace(estimate, tol_reached=tol_reached)
+    kept.estimate = estimate
+    return estimate
 
 
 def _end_of(estimate: Expectation) -> int:
@@ -273,14 +298,3 @@ def _needs_no_more_samples(
     if tol is None or estimate.num_samples < least_samples:
         return False
     return is_reached(estimate, tol) or is_stuck(estimate, tol)
-
-
-def _with_tol_reached(
-    estimate: Expectation, least_samples: int, tol: float | None
-) -> Expectation:
-    """The estimate, which now says whether it reached the tolerance."""
-    if tol is None:
-        return dataclasses.replace(estimate, tol_reached=None)
-    has_enough = estimate.num_samples >= least_samples
-    tol_reached = has_enough and is_reached(estimate, tol)
-    return dataclasses.replace(estimate, tol_reached=tol_reached)

@@ -15,6 +15,9 @@ from .._simulation import Problem
 # Deviations up to this many roundings of the mean count as rounding errors, since those of
 # many operations add up: up to 2e-13 of the mean in double precision, 1e-4 in single.
 ROUNDING = 1e3
+# Samples have smaller numbers than this. Their keys are made of two words of 32 bits, of
+# which the last values of the first word belong to trials.
+MOST_SAMPLES = 2**63
 
 
 class Averaged(NamedTuple):

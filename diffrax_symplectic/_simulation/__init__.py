@@ -29,6 +29,7 @@ from .levels import (
     halved,
     Level,
     level_weights,
+    MOST_LEVELS,
     with_next_level,
 )
 from .loop import (

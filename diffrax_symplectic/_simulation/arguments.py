@@ -12,7 +12,15 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from .._arguments import brief, check_real, check_takes, check_untraced, takes_args
+from .._arguments import (
+    brief,
+    check_args,
+    check_numbers,
+    check_real,
+    check_takes,
+    check_untraced,
+    takes_args,
+)
 from .._brownian import (
     check_key,
     Discrete,
@@ -60,14 +68,20 @@ class StepNumbers(NamedTuple):
 
 def checked_key(caller: str, key: Any, others: Any) -> PRNGKeyArray:
     """The key that `caller` was called with, as a typed key. Raises a `ValueError` unless
-    it is a random key, and for traced arrays in it or in the other arguments."""
+    it is one random key, and for traced arrays in it or in the other arguments."""
     # Inside `jit` a new array is traced, too. Functions that close over traced values of
     # other transformations are found later, when a result that depends on these values is
     # read.
     new_array = jnp.zeros(())
     check_untraced(f"`{caller}`", (key, others, new_array))
     check_key(key, caller)
-    return typed_key(key)
+    key = typed_key(key)
+    if key.shape != ():
+        raise ValueError(
+            f"`{caller}` needs one random key, from which all paths get theirs; got keys "
+            f"of shape {key.shape}."
+        )
+    return key
 
 
 def step_numbers(
@@ -109,7 +123,9 @@ def step_numbers(
 
 
 def given_state(y0: Y) -> Y:
-    """The initial state in floating-point numbers."""
+    """The initial state in floating-point numbers. Raises a `ValueError` if it holds
+    anything else than numbers and arrays of numbers."""
+    check_numbers("y0", y0)
     return jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
 
 
@@ -136,6 +152,7 @@ def drawn_args(args_of: Callable, key: PRNGKeyArray) -> Args:
         )
         raise
 
+    check_args(args)
     # Each path has its own arrays of JAX. All paths share leaves that are no arrays.
     return jtu.tree_map(_with_jax_arrays, args)
 

@@ -3,6 +3,7 @@ that all samples share, and consecutive sample numbers."""
 
 import dataclasses
 import functools as ft
+import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
@@ -35,6 +36,9 @@ from .problem import Problem
 
 # Stragglers that are a larger share of all paths take most of the time.
 _MOST_STRAGGLERS = 0.05
+# Dr.Jit aborts the process if two threads call one frozen function at the same time. A
+# kernel uses all cores, so that taking turns costs no time.
+_IN_TURN = threading.RLock()
 
 
 def warn_of_stragglers(
@@ -132,7 +136,8 @@ def by_drjit(
     Raises an `ImportError` without Dr.Jit, and a `ValueError` if the system cannot be
     replayed."""
     try:
-        fused = _fused_batch(problem, key, sample_numbers, level)
+        with _IN_TURN:
+            fused = _fused_batch(problem, key, sample_numbers, level)
     except ImportError as error:
         raise ImportError(
             f'`engine="drjit"` needs Dr.Jit. {error}; or pass `engine="jax"`, which needs '
@@ -171,7 +176,8 @@ def _fused_batch(
         np.stack([entries_after[step][k] for step in saved_steps.tolist()], axis=1)
         for k in range(len(lanes.y))
     ]
-    is_unfinished = np.asarray(lanes.stopped)
+    # A copy: all arrays of Dr.Jit are freed while no other thread uses it.
+    is_unfinished = np.array(lanes.stopped)
     return Batch(
         y=_states_of_entries(problem.y0, entries),
         failed=is_unfinished,

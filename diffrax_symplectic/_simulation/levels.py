@@ -14,6 +14,8 @@ from .arguments import StepNumbers
 
 # Numbers of steps are 32-bit integers.
 _MOST_STEPS = 2**31
+# One more would have more steps than that.
+MOST_LEVELS = 31
 
 
 class Level(eqx.Module):

@@ -19,7 +19,15 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 
-from .._arguments import check_solver, check_state, check_untraced, whole_number
+from .._arguments import (
+    check_args,
+    check_made_for_noise,
+    check_solver,
+    check_state,
+    check_terms,
+    check_untraced,
+    whole_number,
+)
 from .._brownian import has_bounded_increments
 from .._compat import is_traced
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
@@ -54,7 +62,7 @@ from .arguments import (
     step_numbers,
     traced_phi,
 )
-from .levels import combinations, Level, level_weights, levels_of
+from .levels import combinations, Level, level_weights, levels_of, MOST_LEVELS
 
 
 # The number that is folded into the key of a sample to draw its `y0` and `args`. The words
@@ -124,12 +132,10 @@ class Problem(eqx.Module):
         """The problem of these arguments of `caller`, with a path of the solver in place of
         each shape in `terms`. `want` is the purpose of these paths, and `key` a key of the
         generator that draws starts. Raises a `ValueError` for bad arguments."""
-        levels = whole_number("levels", levels)
+        levels = whole_number("levels", levels, 1, MOST_LEVELS)
+        check_terms(terms)
         check_solver("solver", solver)
-        if isinstance(solver, diffrax.HalfSolver):
-            raise ValueError(
-                "`solver` must take fixed steps; got a `diffrax.HalfSolver`."
-            )
+        check_made_for_noise(solver)
         # For each path in `terms`, whether the solver makes it.
         is_made_by_solver = which_are_shapes(terms)
         # The paths get keys for an example. In each sample others take their place.
@@ -144,6 +150,7 @@ class Problem(eqx.Module):
             args = drawn_args(args_of, key)
             args_of = traced(ft.partial(drawn_args, args_of), key, identity=args_of)
         else:
+            check_args(args)
             # Other numbers compile nothing anew.
             args = jtu.tree_map(_number_as_array, args)
         y0_of = y0 if callable(y0) else None
@@ -374,6 +381,11 @@ class Problem(eqx.Module):
     def dtype(self) -> Any:
         """The dtype of the state, which times and fits have, too."""
         return jnp.result_type(*jtu.tree_leaves(self.y0))
+
+    @property
+    def bytes_of_state(self) -> int:
+        """The memory that a state takes."""
+        return sum(leaf.nbytes for leaf in jtu.tree_leaves(self.y0))
 
     @property
     def output_shape(self) -> tuple[int, int]:

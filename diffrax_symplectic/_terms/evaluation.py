@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from .._arguments import shapes
+from .._arguments import is_numeric, shapes
 from .._custom_types import Args
 from .._programs import note_call
 
@@ -44,6 +44,10 @@ def call_user_function(
         # Errors of Python and JAX about `None` name its type.
         if args is None and "NoneType" in str(error):
             error.add_note(f"`{name}` was called with `args=None`. Was it left out?")
+        # A function may compare words, but not compute with them.
+        kinds = {type(x).__name__ for x in jtu.tree_leaves(args) if not is_numeric(x)}
+        if kinds:
+            error.add_note(f"`args` hold no numbers, but {', '.join(sorted(kinds))}.")
         raise
 
 

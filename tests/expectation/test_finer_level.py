@@ -1,7 +1,5 @@
 """A trial with a third level tells where two levels agree on a wrong mean."""
 
-import dataclasses
-import sys
 import warnings
 
 import diffrax
@@ -170,16 +168,3 @@ def test_later_parts_are_not_tried_again():
     sampling = ds.IndependentPaths(8192)
     assert _of_oscillator(1.0, sampling=sampling)[1] is not None
     assert _of_oscillator(1.0, sampling=sampling, first=8192)[1] is None
-
-
-def test_an_interrupted_trial_leaves_the_estimate(monkeypatch):
-    def interrupted(estimate, *rest):
-        raise ds.ExpectationInterrupted(dataclasses.replace(estimate, moments=()))
-
-    # The function of the same name hides its module.
-    module = sys.modules["diffrax_symplectic._expectation.expectation"]
-    monkeypatch.setattr(module, "changes_with_finer_level", interrupted)
-    sampling = ds.IndependentPaths(1024)
-    with pytest.raises(ds.ExpectationInterrupted) as info:
-        _of_oscillator(0.1, t1=1, sampling=sampling)
-    assert info.value.estimate.num_paths == 1024

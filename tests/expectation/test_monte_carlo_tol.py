@@ -160,7 +160,7 @@ def test_one_word_for_a_tolerance_that_was_not_reached():
     [
         (dict(tol=0.0), "`tol` must be a positive number"),
         (dict(tol=float("nan")), "`tol` must be a positive number"),
-        (dict(levels=0), "`levels` must be a positive integer"),
+        (dict(levels=0), "`levels` must be an integer from 1 to 31"),
         (dict(levels=2), "the weak order of the solver"),
         (dict(levels=2, order=0), "`order` must be a positive integer"),
         (dict(levels=2, order=1.5), "`order` must be a positive integer, or 1/2"),

@@ -1,7 +1,6 @@
 """Estimates of expectations, with error bars from the moments of the samples."""
 
 import dataclasses
-import json
 import math
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -11,6 +10,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
+from ..._arguments import is_real_number
 from ..._simulation import Combination
 from .error_bars import (
     is_off_order,
@@ -20,7 +20,15 @@ from .error_bars import (
     results_of,
 )
 from .moments import combined_in_halves, Moments, total
-from .saved import arrays_of, fields_from, header_of
+from .saved import (
+    arrays_of,
+    Contents,
+    fields_from,
+    header_of,
+    OtherVersion,
+    read,
+    write,
+)
 
 
 # NumPy operations on zero-dimensional arrays return scalars.
@@ -220,7 +228,16 @@ class Expectation(eqx.Module):
         """The ends of a confidence interval: `mean` plus and minus `error` times the
         quantile of Student's $t$ with `num_samples - 1` degrees of freedom. (For 95% this
         is 2.13 with 16 samples, and 1.96 with very many.) Where sampling is a small part of
-        `error` the interval holds the mean more often than that."""
+        `error` the interval holds the mean more often than that.
+
+        **Raises:** a `ValueError` unless `confidence` is a number between 0 and 1.
+        """
+        is_number = is_real_number(confidence) and np.ndim(confidence) == 0
+        if not (is_number and 0 < confidence < 1):
+            raise ValueError(
+                "`confidence` must be a number between 0 and 1, such as 0.95; got "
+                f"{confidence!r}."
+            )
         # SciPy is imported here, since it would double the time to import this package.
         from scipy.special import stdtrit
 
@@ -267,30 +284,35 @@ class Expectation(eqx.Module):
         )
 
     def save(self, file: str | Path | BinaryIO) -> None:
-        """Writes the estimate to a NumPy `.npz` file, which `Expectation.load` reads.
+        """Writes the estimate to a NumPy `.npz` file, which `Expectation.load` reads. An
+        older file is replaced by the whole new one, or if anything fails kept as it is.
         $\\phi$ must be made of dictionaries, lists, tuples and arrays. Functions in
         `sampling`, such as `sort_by`, are not saved."""
-        arrays = arrays_of(self)
-        arrays["header"] = np.array(json.dumps(header_of(self)))
-        if isinstance(file, str | Path):
-            with open(file, "wb") as opened:
-                np.savez(opened, **arrays)  # pyright: ignore
-        else:
-            np.savez(file, **arrays)  # pyright: ignore
+        _check_file(file, "write")
+        write(file, Contents(header_of(self), arrays_of(self)))
 
     @staticmethod
     def load(file: str | Path | BinaryIO) -> "Expectation":
         """Reads an estimate written by `save`. No code from the file is executed.
 
-        **Raises:** a `ValueError` for another file, and for a sampling that this version
-        does not have. Warns of a file without the digests by which `merge` and `start=`
-        tell the arguments of estimates.
+        **Raises:** a `ValueError` for a file that is damaged or another, and for a sampling
+        that this version does not have. Warns of a file without the digests by which
+        `merge` and `start=` tell the arguments of estimates.
         """
-        with np.load(file, allow_pickle=False) as arrays:
-            if "header" not in arrays:
-                raise ValueError(f"{file} was not written by `Expectation.save`.")
-            header = json.loads(str(arrays["header"]))
-            return Expectation(**fields_from(header, arrays))
+        _check_file(file, "read")
+        if isinstance(file, str | Path):
+            with open(file, "rb") as opened:
+                return Expectation.load(opened)
+        try:
+            return Expectation(**fields_from(read(file)))
+        except OtherVersion:
+            raise
+        except Exception:
+            # There are as many kinds of errors as of damage.
+            raise ValueError(
+                f"{getattr(file, 'name', 'The file')} is damaged, or was not written by "
+                "`Expectation.save`."
+            ) from None
 
     def __str__(self) -> str:
         lines = self._lines_of_means()
@@ -343,6 +365,14 @@ class Expectation(eqx.Module):
         """What follows from the moments for one combination of levels."""
         whole = total(self.moments)
         return results_of(whole, self.rounding_floor, self.tails, combination)
+
+
+def _check_file(file: Any, method: str) -> None:
+    """Raises a `ValueError` unless this is a path, or has the method of an open file."""
+    if not isinstance(file, str | Path) and not hasattr(file, method):
+        raise ValueError(
+            f"`file` must be a path, or a file that is open in binary mode; got {file!r}."
+        )
 
 
 def combined_results(estimate: Expectation, combination: Combination) -> Results:

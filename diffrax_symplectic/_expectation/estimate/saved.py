@@ -1,15 +1,24 @@
 """Estimates in files: arrays, and their structure as JSON."""
 
 import dataclasses
+import io
+import json
+import os
+import secrets
 import warnings
+import zipfile
 from collections.abc import Iterator, Mapping
-from typing import Any
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
 
+import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PyTree
 
-from ..sampling import Averaged, SAVED_SAMPLINGS
+from ..._arguments import whole_number
+from ..._simulation import level_weights
+from ..sampling import Averaged, MOST_SAMPLES, SAVED_SAMPLINGS
 from .moments import Moments
 
 
@@ -19,6 +28,62 @@ _AVERAGED = ("mean", "norm", "largest", "size")
 _NUMBERS = ("begin", "end", "num_good", "num_failed", "failed_on")
 # The fields of an estimate that JSON takes as they are.
 _FIELDS_OF_ESTIMATE = ("paths_per_sample", "rounding_floor", "reason", "tol_reached")
+
+
+class OtherVersion(ValueError):
+    """An estimate was written by a version that had more than this one."""
+
+
+class Contents(NamedTuple):
+    """What a file holds.
+
+    - `header`: all but the arrays, as `header_of` makes it.
+    - `arrays`: the arrays, as `arrays_of` makes them.
+    """
+
+    header: dict[str, Any]
+    arrays: Mapping[str, np.ndarray]
+
+
+def write(file: str | Path | BinaryIO, contents: Contents) -> None:
+    """Writes a NumPy `.npz` file. A file that is there already is replaced by the whole new
+    one, or if anything fails kept as it is."""
+    arrays = {**contents.arrays, "header": np.array(json.dumps(contents.header))}
+    if not isinstance(file, str | Path):
+        np.savez(file, **arrays)  # pyright: ignore
+        return
+    path = Path(file).resolve()
+    # Several processes may save to one path.
+    beside = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
+    try:
+        with open(beside, "xb") as opened:
+            np.savez(opened, **arrays)  # pyright: ignore
+            opened.flush()
+            os.fsync(opened.fileno())
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def read(file: BinaryIO) -> Contents:
+    """The contents of a file that `write` wrote. Raises any error for another file."""
+    with zipfile.ZipFile(file) as archive:
+        # This compares checksums, before anything is taken for an array.
+        arrays = {
+            name.removesuffix(".npy"): _array_in(archive.read(name))
+            for name in archive.namelist()
+        }
+    return Contents(json.loads(str(arrays.pop("header"))), arrays)
+
+
+def _array_in(content: bytes) -> np.ndarray:
+    """The array of a NumPy file. Objects in it are refused, so that no code is executed,
+    and so are shapes that its numbers do not fill."""
+    file = io.BytesIO(content)
+    np.lib.format.read_magic(file)
+    shape, in_columns, dtype = np.lib.format.read_array_header_1_0(file)
+    order = "F" if in_columns else "C"
+    return np.frombuffer(file.read(), dtype).reshape(shape, order=order)
 
 
 def header_of(estimate: Any) -> dict[str, Any]:
@@ -74,17 +139,30 @@ def _name_of_leaf(tree: str, leaf: int) -> str:
     return f"{tree}_{leaf}"
 
 
-def fields_from(
-    header: dict[str, Any], arrays: Mapping[str, np.ndarray]
-) -> dict[str, Any]:
+def fields_from(contents: Contents) -> dict[str, Any]:
     """The fields of the `Expectation` from which `header_of` and `arrays_of` made these.
-    Raises a `ValueError` for an unknown sampling."""
+    Raises an `OtherVersion` for an unknown sampling, and any error for contents that no
+    estimate has."""
+    header, arrays = contents
+    _check_counts(header)
     structure = header["structure"]
     num_leaves = len(header["dtypes"])
+    # Of each leaf of `phi` there are several arrays, all of one shape.
+    shapes = [arrays[_name_of_leaf("mean_value_0", k)].shape for k in range(num_leaves)]
+    levels = len(header["ranges"][0][-1])
+    # From three levels on, the combinations are the same.
+    num_combinations = len(level_weights(1, min(levels, 3)))
+    _check(all(shape[0] == num_combinations for shape in shapes))
+    _check(all(jnp.finfo(dtype) for dtype in header["dtypes"]))
+    _check(arrays["key_data"].dtype == np.uint32)
 
     def tree(name: str) -> PyTree[np.ndarray]:
         leaves = [arrays[_name_of_leaf(name, leaf)] for leaf in range(num_leaves)]
-        return _tree_of(structure, iter(leaves))
+        _check([leaf.shape for leaf in leaves] == shapes)
+        _check(all(leaf.dtype == np.float64 for leaf in leaves))
+        tree = _tree_of(structure, iter(leaves))
+        _check(len(jtu.tree_leaves(tree)) == num_leaves)
+        return tree
 
     def averaged(name: str, batch: int) -> Averaged:
         fields = header["averaged"]
@@ -119,14 +197,39 @@ def fields_from(
     }
 
 
+def _check_counts(header: dict[str, Any]) -> None:
+    """Raises a `ValueError` for numbers of samples and paths that no estimate has."""
+    paths_per_sample = whole_number("paths_per_sample", header["paths_per_sample"])
+    whole_number("rounding_floor", header["rounding_floor"])
+    levels = len(header["ranges"][0][-1])
+    _check(levels > 0)
+    end_before = 0
+    for begin, end, num_good, num_failed, failed_on in header["ranges"]:
+        whole_number("begin", begin, end_before)
+        whole_number("end", end, begin, MOST_SAMPLES)
+        whole_number("num_good", num_good, 0, end - begin)
+        num_paths = (end - begin) * paths_per_sample
+        whole_number("num_failed", num_failed, 0, num_paths)
+        _check(len(failed_on) == levels)
+        for number in failed_on:
+            whole_number("failed_on", number, 0, num_failed)
+        end_before = end
+
+
+def _check(is_so: bool) -> None:
+    """Raises a `ValueError` unless this is so."""
+    if not is_so:
+        raise ValueError
+
+
 def _sampling_from(header: dict[str, Any]) -> Any:
-    """The sampling, without the functions that it may have had. Raises a `ValueError` if
+    """The sampling, without the functions that it may have had. Raises an `OtherVersion` if
     this version does not have it, or not all of its fields."""
     name = header["sampling"]
     if name is None:
         return None
     if name not in SAVED_SAMPLINGS:
-        raise ValueError(
+        raise OtherVersion(
             f"The estimate was sampled by `{name}`, which this version does not have. Read "
             "it with the version that wrote it."
         )
@@ -134,7 +237,7 @@ def _sampling_from(header: dict[str, Any]) -> Any:
     own_names = {field.name for field in dataclasses.fields(sampling)}
     unknown_names = sorted(header["fields"].keys() - own_names)
     if unknown_names:
-        raise ValueError(
+        raise OtherVersion(
             f"The estimate was sampled by `{name}` with {', '.join(unknown_names)}, which "
             "this version does not have. Read it with the version that wrote it."
         )

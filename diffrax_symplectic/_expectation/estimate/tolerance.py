@@ -71,8 +71,10 @@ def shortfall(estimate: Expectation, tol: float) -> str:
         )
     # What the other parts of the error leave of the tolerance, at least a tenth.
     others = np.hypot(discretization, failed_error)
-    allowed = max(tol**2 - others**2, (tol / 10) ** 2) ** 0.5
-    needed_paths = estimate.num_paths * (sampling_error / allowed) ** 2
+    # The square of a small tolerance would underflow.
+    allowed = max(np.sqrt(max(tol - others, 0.0)) * np.sqrt(tol + others), tol / 10)
+    ratio = sampling_error / float(allowed)
+    needed_paths = estimate.num_paths * ratio * ratio
     return (
         f"the sampling error is {sampling_error:.1e} after {estimate.num_paths:,} paths. "
         f"It takes about {needed_paths:.1e} paths: continue with `start=`, or pass another "

@@ -17,7 +17,7 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from ..._arguments import check_untraced, whole_number
+from ..._arguments import check_memory, check_untraced, whole_number
 from ..._custom_types import Devices
 from ..._lapack import lapack_in_turn
 from ..._programs import compiled
@@ -94,6 +94,7 @@ class ValueFunctions(AbstractSampling):
     )
 
     def prepare(self, problem, key, devices):
+        check_memory("batch_size", self.batch_size, problem.bytes_of_state, devices[0])
         chosen = chosen_basis(problem, self.degree)
         warn_of_long_fit(chosen, stacklevel=_FRAMES_TO_USER)
         basis = chosen.basis

@@ -14,7 +14,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray, PyTree, UInt32
 
-from ..._arguments import check_real, check_takes, whole_number
+from ..._arguments import check_memory, check_real, check_takes, whole_number
 from ..._brownian import (
     AbstractStepwisePath,
     checked_stepwise,
@@ -131,6 +131,7 @@ class ArrayRQMC(AbstractSampling):
         coordinates = jax.eval_shape(sort_by, problem.y0)
         check_real("sort_by", jtu.tree_leaves(coordinates))
         num_coordinates = jax.eval_shape(lambda: real_vector(sort_by(problem.y0))).size
+        check_memory("num_paths", self.num_paths, problem.bytes_of_state, devices[0])
         points = jnp.asarray(sobol_points(self.num_paths, layout.num_words))
         _warn_of_many_coordinates(self.num_paths, num_coordinates, stacklevel=5)
         return SamplingPlan(

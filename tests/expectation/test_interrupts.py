@@ -1,0 +1,110 @@
+"""An interrupt loses no batch that was finished, wherever it comes."""
+
+import sys
+
+import diffrax
+import jax.numpy as jnp
+import jax.random as jr
+import pytest
+
+import diffrax_symplectic as ds
+
+
+# The functions of the same names hide their modules.
+EXPECTATION = sys.modules["diffrax_symplectic._expectation.expectation"]
+MONTE_CARLO = sys.modules["diffrax_symplectic._expectation.monte_carlo"]
+TERMS = ds.hamiltonian_terms(
+    lambda t, p, q, args: p**2 / 2 - jnp.cos(q), lambda t, p, q, args: 0.01 * q, ()
+)
+
+
+def _square(t, y, args):
+    return y[1] ** 2
+
+
+def _mean(num_paths=512, **options):
+    y0 = jnp.array(0.0), jnp.array(1.0)
+    sampling = ds.IndependentPaths(num_paths, 256)
+    return ds.expectation(
+        _square, TERMS, ds.StormerVerlet(), 0, 1, 0.5, y0, key=jr.key(0),
+        sampling=sampling, **options,
+    )  # fmt: skip
+
+
+def _interrupted(*args, **kwargs):
+    raise KeyboardInterrupt
+
+
+class _Closing(diffrax.AbstractProgressMeter):
+    """Takes so long to close that the user interrupts it."""
+
+    def init(self):
+        return None
+
+    def step(self, state, progress):
+        return None
+
+    def close(self, state):
+        raise KeyboardInterrupt
+
+
+def _check_interrupted(call, num_paths):
+    with pytest.raises(KeyboardInterrupt) as info:
+        call()
+    assert isinstance(info.value, ds.ExpectationInterrupted)
+    assert info.value.estimate.num_paths == num_paths
+    return info.value.estimate
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["may_be_too_long", "cautions", "too_long_steps", "changes_with_finer_level"],
+)
+def test_an_interrupt_after_the_last_sample_keeps_all(name, monkeypatch):
+    if name == "may_be_too_long":
+        # It is asked if most paths fail.
+        monkeypatch.setattr(ds.Expectation, "num_failed", 1000)
+    monkeypatch.setattr(EXPECTATION, name, _interrupted)
+    _check_interrupted(_mean, 512)
+
+
+def test_an_interrupt_while_the_meter_closes_keeps_all():
+    _check_interrupted(lambda: _mean(progress_meter=_Closing()), 512)
+    draw = lambda meter: ds.monte_carlo(
+        jr.normal, key=jr.key(0), num_paths=16, progress_meter=meter
+    )
+    _check_interrupted(lambda: draw(_Closing()), 16)
+
+
+def test_an_interrupt_while_a_user_is_warned_keeps_all(monkeypatch):
+    monkeypatch.setattr(MONTE_CARLO, "cautions", _interrupted)
+    _check_interrupted(
+        lambda: ds.monte_carlo(jr.normal, key=jr.key(0), num_paths=16), 16
+    )
+
+
+def test_an_interrupt_between_levels_keeps_the_finished_one(monkeypatch):
+    choose = EXPECTATION.choose
+    chosen = []
+
+    def interrupted_at_third_level(problem_of, request):
+        if chosen:
+            raise KeyboardInterrupt
+        chosen.append(choose(problem_of, request))
+        return chosen[0]
+
+    whole = _mean(512, levels=2)
+    monkeypatch.setattr(EXPECTATION, "choose", interrupted_at_third_level)
+    # A third of the discretization error of two levels.
+    tol = float(whole.discretization_error) / 3
+    got = _check_interrupted(lambda: _mean(10**6, tol=tol), 256)
+    assert got.levels == 2 and got.tol_reached is False
+    monkeypatch.undo()
+    assert _mean(512, start=got).mean == whole.mean
+
+
+def test_an_interrupt_before_the_first_batch_is_a_plain_one(monkeypatch):
+    monkeypatch.setattr(EXPECTATION, "choose", _interrupted)
+    with pytest.raises(KeyboardInterrupt) as info:
+        _mean()
+    assert info.type is KeyboardInterrupt
