@@ -263,3 +263,15 @@ def test_allowed_states_are_those_of_the_constraint_of_now():
     for new in (1.0, 5.0):
         k = new
         np.testing.assert_allclose(allowed(), k)
+
+
+def test_functions_may_need_the_values_of_numbers_in_args():
+    def well(t, p, q, args):
+        return p**2 / 2 + (q**4 if args > 1 else q**2)
+
+    terms = ds.hamiltonian_terms(well, lambda t, p, q, args: q, ())
+    y0 = (0 * ONE, 2 * ONE)
+    for args, force in ((0.3, -4.0), (1.7, -32.0)):
+        problem = problem_of(terms, y0=y0, args=args)
+        drift, _ = split_terms(problem.terms)
+        assert rate(drift, 0.0, y0, problem.args)[0] == force

@@ -41,6 +41,7 @@ from .._terms import (
     check_stratonovich,
     constraint_of,
     motion_numbers,
+    NEED_VALUES,
     step_variables,
     StepVariables,
     truncated_in_unit,
@@ -151,24 +152,36 @@ class Problem(eqx.Module):
             args_of = traced(ft.partial(drawn_args, args_of), key, identity=args_of)
         else:
             check_args(args)
-            # Other numbers compile nothing anew.
-            args = jtu.tree_map(_number_as_array, args)
         y0_of = y0 if callable(y0) else None
-        if y0_of is not None:
-            y0 = drawn_state(y0_of, key, args)
-            draw = ft.partial(drawn_state, y0_of)
-            y0_of = traced(draw, key, args, identity=y0_of)
-        else:
-            y0 = given_state(y0)
+        y0 = given_state(y0) if y0_of is None else drawn_state(y0_of, key, args)
         check_state(caller, y0)
         if y0_of is None:
             check_finite(y0)
 
         # Times have the dtype of the state.
         t0_of_dtype = np.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
-        phi = traced_phi(phi, terms, t0_of_dtype, y0, args)
-        terms = with_programs(terms, t0_of_dtype, y0, args)
-        solver = with_programs(solver, t0_of_dtype, y0, args)
+
+        def programs(args: Args) -> tuple[Any, ...]:
+            """All functions that are called with `args`, as programs, and these `args`."""
+            draw_y0 = None
+            if y0_of is not None:
+                draw = ft.partial(drawn_state, y0_of)
+                draw_y0 = traced(draw, key, args, identity=y0_of)
+            return (
+                traced_phi(phi, terms, t0_of_dtype, y0, args),
+                with_programs(terms, t0_of_dtype, y0, args),
+                with_programs(solver, t0_of_dtype, y0, args),
+                draw_y0,
+                args,
+            )
+
+        # Other numbers compile nothing anew if they are in arrays. But a function may need
+        # the values of numbers of Python, in an `if`.
+        try:
+            with_arrays = programs(jtu.tree_map(_number_as_array, args))
+        except (ValueError, *NEED_VALUES):
+            with_arrays = None
+        phi, terms, solver, y0_of, args = with_arrays or programs(args)
         # What a function closes over shows in its program.
         check_untraced(f"`{caller}`", (phi, terms, solver, y0_of, args_of))
         check_fit(terms, t0_of_dtype, y0, args)

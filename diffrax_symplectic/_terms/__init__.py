@@ -31,7 +31,7 @@ from .constrained_drift import with_constraint, without_constraint
 from .constraint import check_start, constrained_state, NormalSpace, Surface
 from .dependence import acts_elementwise, Dependence
 from .drift_and_noise import control_struct, field_of, number_of_noises, split_terms
-from .evaluation import call_user_function
+from .evaluation import call_user_function, NEED_VALUES
 from .hamiltonian import hamiltonian_terms, noise_terms
 from .ito import ito_drift
 from .langevin import AbstractFriction, bath_terms, BathNoise, friction_apart

@@ -15,7 +15,7 @@ from .._programs import note_call
 
 
 # Errors of a function that needs the values of its arguments while JAX traces it.
-_NEED_VALUES = (
+NEED_VALUES = (
     jax.errors.ConcretizationTypeError,
     jax.errors.NonConcreteBooleanIndexError,
     jax.errors.TracerArrayConversionError,
@@ -34,7 +34,7 @@ def call_user_function(
     note_call(function, *inputs, copy)
     try:
         return function(*inputs, copy)
-    except _NEED_VALUES as error:
+    except NEED_VALUES as error:
         raise ValueError(
             f"`{name}` needs concrete values while JAX traces it, in an `if`, `while`, "
             "`float`, an index `x[x > 0]`, or a NumPy function. Write `jnp.where(a, b, c)` "
