@@ -49,7 +49,7 @@ from ._compat import (
 
 # The most programs that are kept, each of up to 30 MB. A call of `expectation` needs up to
 # ten. What is dropped is compiled again when it is needed again.
-_MOST_PROGRAMS = 128
+_MOST_PROGRAMS = 64
 # The most calls that are compared. Functions that are made anew in each trace would add to
 # them without end.
 _MOST_CALLS = 64
@@ -376,7 +376,7 @@ def compiled(fn: Callable[..., Result], quickly: bool = False) -> Callable[..., 
             # values of another, before it calls `fn`. It has no class of errors for this.
             if "`compiler_options`" not in str(error):
                 raise
-        return of_arrays(arrays)
+        return compiled(fn)(*args)
 
     return call
 

@@ -225,7 +225,7 @@ def expectation(
             advice = lost_numbers
         elif lost_numbers is not None:
             warnings.warn(lost_numbers, stacklevel=2)
-        elif most_fail and may_be_too_long(problem):
+        elif most_fail and may_be_too_long(problem.with_any_steps()):
             advice = (
                 f"Most likely, steps of `dt0={float(dt0):g}` are too long for "
                 f"`{type(solver).__name__}`: pass `dt0={float(dt0) / 4:g}` or less, or an "
@@ -242,7 +242,9 @@ def expectation(
         # Warnings of the problem come with its first samples, and not again with later
         # parts.
         if start is None and first == 0:
-            messages = _messages_on_steps(estimate, problem, float(dt0))
+            messages = _messages_on_steps(
+                estimate, problem.with_any_steps(), float(dt0)
+            )
             # A trial takes longer than these looks, which name the cause.
             if estimate.levels == 2 and not messages:
                 trial = trial_with_finer_level(

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._brownian import zeros_and_unravel
 from .._custom_types import Args, Terms, Y
+from .._programs import once_for_each_signature
 from .._simulation import Problem
 from .._terms import (
     apply,
@@ -49,7 +50,12 @@ def noise_field(noise: Terms, args: Args) -> Field:
 
 def depends_on_time(field: Field, problem: Problem, y0: Y) -> bool:
     """Whether a field reads the time, by its dependence, not by its values."""
-    dependence = Dependence(lambda t: field(t, y0), jnp.asarray(problem.t0))
+    return _depends_on_time(field, jnp.asarray(problem.t0), y0)
+
+
+@once_for_each_signature
+def _depends_on_time(field: Field, t0: Array, y0: Y) -> bool:
+    dependence = Dependence(lambda t: field(t, y0), t0)
     return not dependence.independent(lambda t: t)
 
 

@@ -43,7 +43,7 @@ class IndependentPaths(AbstractSampling):
 
     def prepare(self, problem, key, devices):
         return self.plan(
-            jtu.Partial(_samples_of_independent_paths, problem),
+            jtu.Partial(_samples_of_independent_paths, problem.with_any_steps()),
             len(problem.levels.h),
             devices,
             problem.bytes_of_state,

@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
 from .._brownian import zeros_and_unravel
 from .._compat import unwrapped
 from .._custom_types import Terms
-from .._programs import compiled
+from .._programs import compiled, once_for_each_signature
 from .._simulation import Problem
 from .._solver import AbstractSymplecticSolver
 from .._terms import (
@@ -30,6 +30,7 @@ from .._terms import (
     rate,
     split_friction,
 )
+from .fields_in_time import depends_on_time, drift_field
 
 
 # A step that enlarges a small change of the state by more than this, and turns it around,
@@ -161,6 +162,7 @@ def _noise_of_user(problem: Problem) -> Terms:
     return tuple(term for term in noise if not isinstance(unwrapped(term), BathNoise))
 
 
+@once_for_each_signature
 def _has_noise_of_state(problem: Problem) -> bool:
     """Whether noise reads the state, by its dependence, not by its values."""
     noise = _noise_of_user(problem)
@@ -186,14 +188,8 @@ def _numbers_of_steps(problem: Problem) -> Float[np.ndarray, " times"]:
     """The numbers of the steps to look at: the first alone if the drift does not depend on
     time."""
     drift, _, _ = split_friction(problem.terms)
-    if not drift:
-        return np.zeros(1, problem.dtype)
-
-    def rate_of_drift(t: Array, y: PyTree[Array]) -> PyTree[Array]:
-        return rate(drift, t, y, problem.args)
-
-    dependence = Dependence(rate_of_drift, problem.t0, problem.y0)
-    if dependence.independent(lambda t, y: t):
+    field = drift_field(drift, problem.args)
+    if not drift or not depends_on_time(field, problem, problem.y0):
         return np.zeros(1, problem.dtype)
     fractions = np.arange(_NUM_TIMES) * _GOLDEN_RATIO % 1
     num_steps = int(problem.level(0).num_steps)

@@ -86,7 +86,7 @@ def by_jax(
     """The paths with these sample numbers, on one level, simulated by JAX, with the loop of
     `expectation`, which simulates all levels."""
     high, low = _words(sample_numbers)
-    states_and_failed = _paths_by_jax(problem, key, high, low)
+    states_and_failed = _paths_by_jax(problem.with_any_steps(), key, high, low)
     # The results are traced if a function of the user closes over traced values.
     check_untraced("`ensemble`", states_and_failed)
     y, failed = jax.device_get(states_and_failed)

@@ -110,8 +110,8 @@ class Problem(eqx.Module):
     # Which paths of the terms are one Brownian motion. Programs, whose keys are traced,
     # cannot tell.
     motion_numbers: tuple[int, ...] = eqx.field(static=True)
-    # The most steps of a level for which arrays have room: twice those of the finest one if
-    # a trial halves all steps. (Shapes must be known when compiling.)
+    # The most steps of a level for which arrays have room. (Shapes must be known when
+    # compiling.)
     most_steps: int = eqx.field(static=True)
 
     @staticmethod
@@ -220,8 +220,13 @@ class Problem(eqx.Module):
             weights=np.asarray(weights, jnp.result_type(float)),
             at_end=ts is None,
             motion_numbers=motion_numbers(brownian_paths(terms)),
-            most_steps=int(all_levels.num_steps[-1]) * (2 if levels == 2 else 1),
+            most_steps=_room_for_steps(int(all_levels.num_steps[-1]), levels),
         )
+
+    def with_any_steps(self) -> "Problem":
+        """The same problem for programs in which no array has room for all steps, so that
+        other numbers of steps compile nothing anew."""
+        return dataclasses.replace(self, most_steps=0)
 
     def level(self, index: IntScalarLike) -> Level:
         """The level with this number, which may be traced."""
@@ -411,6 +416,14 @@ def _order_of(solver: diffrax.AbstractSolver, terms: PyTree) -> int | float:
     """The weak order of a solver. Solvers of other packages have no `weak_order`, and
     solvers of the user may not state theirs: it counts as 1."""
     return getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
+
+
+def _room_for_steps(finest_steps: int, levels: int) -> int:
+    """The steps for which programs have room, for this many on the finest of the levels."""
+    # With two levels a trial halves all steps.
+    most = 2 * finest_steps if levels == 2 else finest_steps
+    # Powers of two, so that most other numbers of steps compile nothing anew.
+    return 1 << (most - 1).bit_length()
 
 
 def _number_as_array(x: Any) -> Any:

@@ -135,7 +135,13 @@ class ArrayRQMC(AbstractSampling):
         points = jnp.asarray(sobol_points(self.num_paths, layout.num_words))
         _warn_of_many_coordinates(self.num_paths, num_coordinates, stacklevel=5)
         return SamplingPlan(
-            jtu.Partial(_samples_of_replicate, problem, sort_by, points, layout),
+            jtu.Partial(
+                _samples_of_replicate,
+                problem.with_any_steps(),
+                sort_by,
+                points,
+                layout,
+            ),
             num_samples=self.replicates,
             # All paths of a replicate are solved at once, which is a batch already.
             batch_size=1,

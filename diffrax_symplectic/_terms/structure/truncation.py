@@ -9,6 +9,7 @@ from jaxtyping import Float, PyTree
 from ..._brownian import TruncatedBrownianPath
 from ..._compat import unwrapped
 from ..._custom_types import Args, RealScalarLike, Y
+from ..._programs import once_for_each_signature
 from ..drift_and_noise import flattened
 from ..langevin import BathNoise
 from ..paths import brownian_paths, motion_numbers, replace_paths
@@ -30,13 +31,20 @@ def which_need_truncation(
     depends_on_state = []
     for term in noise:
         is_bath = isinstance(unwrapped(term), BathNoise)
-        depends = not is_bath and additive_fault((term,), t0, y0, args) is not None
+        depends = not is_bath and _depends_on_state(term, t0, y0, args)
         depends_on_state += [depends] * len(brownian_paths(term))
     # Equal paths are one Brownian motion, which has one law.
     numbers = motion_numbers(brownian_paths(terms))
     flags = zip(numbers, depends_on_state)
     truncated_numbers = {number for number, depends in flags if depends}
     return tuple(number in truncated_numbers for number in numbers)
+
+
+@once_for_each_signature
+def _depends_on_state(
+    term: diffrax.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args
+) -> bool:
+    return additive_fault((term,), t0, y0, args) is not None
 
 
 def without_truncation(
