@@ -13,13 +13,13 @@ from .arguments import (
     checked_key,
     has_discrete_increments,
     is_multiple,
+    state_itself,
     warn_of_truncation,
 )
 from .engines import (
     Batch,
     by_drjit,
     ENGINES,
-    state_itself,
     warn_of_stragglers,
 )
 from .levels import (

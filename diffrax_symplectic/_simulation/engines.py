@@ -74,12 +74,6 @@ class Batch(NamedTuple):
     num_stragglers: int = 0
 
 
-def state_itself(t, y, args):
-    """The state: the function `phi` of a problem whose states are wanted."""
-    del t, args
-    return y
-
-
 def by_jax(
     problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> Batch:

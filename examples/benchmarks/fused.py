@@ -23,7 +23,8 @@ import jax.random as jr
 import numpy as np
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._simulation.engines import fused_start, state_itself
+from diffrax_symplectic._simulation.arguments import state_itself
+from diffrax_symplectic._simulation.engines import fused_start
 from diffrax_symplectic._simulation.problem import Problem
 
 from .. import rigid_body
