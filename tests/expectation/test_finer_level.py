@@ -168,3 +168,47 @@ def test_later_parts_are_not_tried_again():
     sampling = ds.IndependentPaths(8192)
     assert _of_oscillator(1.0, sampling=sampling)[1] is not None
     assert _of_oscillator(1.0, sampling=sampling, first=8192)[1] is None
+
+
+def _rotating(steps, **options):
+    """The mean square of the position of a charge in crossed fields in a bath, with this
+    many steps."""
+
+    def energy(t, p, q, args):
+        potential = 1.5 * jnp.array([-q[1], q[0]])
+        return jnp.sum((p - potential) ** 2) / 2 - 0.4 * q[0]
+
+    terms = ds.langevin_terms(energy, 0.5, 0.8, (2,))
+    solver = ds.BAOAB(ds.ImplicitMidpoint())
+    rest = jnp.zeros(2), jnp.zeros(2)
+    first = lambda t, y, args: y[1][0] ** 2
+    return _told(first, terms, solver, 0, 24, 24 / steps, rest, **options)
+
+
+# By value functions with 240 steps.
+MEAN_OF_ROTATION = 2.46622
+FITTED = ds.ValueFunctions(degree=2, num_paths=64)
+
+
+def test_a_rotation_that_steps_miss_is_told_where_the_bar_is_small():
+    """Near a maximum of the bias two levels agree, 24 bars off. Plain paths would not show
+    the change."""
+    got, message = _rotating(15, sampling=FITTED)
+    assert abs(got.mean - MEAN_OF_ROTATION) > 10 * got.error
+    assert "changes a mean by" in message
+
+
+@pytest.mark.slow
+def test_a_rotation_that_steps_resolve_is_not_told():
+    got, message = _rotating(60, sampling=FITTED)
+    assert abs(got.mean - MEAN_OF_ROTATION) < got.error
+    assert message is None
+
+
+def test_what_a_trial_could_not_see_is_printed():
+    few = ds.IndependentPaths(2000)
+    got, message = _of_oscillator(1.0, t1=10, sampling=few)
+    if message is None:
+        assert "would have shown an error of the step above" in str(got)
+    many, _ = _of_oscillator(0.05, t1=1, sampling=few)
+    assert many.caveat == ""

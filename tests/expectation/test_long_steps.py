@@ -51,6 +51,12 @@ OSCILLATOR = ds.hamiltonian_terms(
 Y1 = jnp.zeros(1), jnp.ones(1)
 
 
+def test_unstable_steps_are_told_with_three_levels_too():
+    """They may fit the order by chance."""
+    terms = ds.langevin_terms(_pendulum, 0.5, 1.0, ())
+    assert _told(terms, ds.BAOAB(), 8.0, levels=3)[1]
+
+
 @pytest.mark.parametrize("h, too_long", [(0.1, False), (1.99, False), (2.02, True)])
 @pytest.mark.parametrize("size", [1, 100])
 def test_the_limit_of_stability_is_told(h, too_long, size):
