@@ -281,14 +281,14 @@ def _is_hashable(x: Any) -> bool:
 class _Same:
     """Compares what cannot be hashed by identity."""
 
-    def __init__(self, x: Any):
-        self._x = x
+    def __init__(self, value: Any):
+        self.value = value
 
     def __eq__(self, other: Any) -> bool:
-        return isinstance(other, _Same) and self._x is other._x
+        return isinstance(other, _Same) and self.value is other.value
 
     def __hash__(self) -> int:
-        return id(self._x)
+        return id(self.value)
 
 
 def static_part(tree: PyTree) -> Hashable:

@@ -20,6 +20,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic import _compat
+from diffrax_symplectic._programs import compiled
 from diffrax_symplectic._stablehlo import array_types
 
 from .drjit_here import needs_drjit
@@ -342,13 +343,13 @@ def test_equinox_names_the_closure_that_it_refuses_to_call():
 
 
 def test_a_program_may_have_compiler_options_unless_it_is_inside_of_another():
-    double = _compat.quickly_compiled(lambda x: 2 * x)
+    double = compiled(lambda x: 2 * x, quickly=True)
     x = jnp.ones(())
     assert double(x) == 2
     assert jax.jit(double)(x) == 2
 
     def captured(x):
-        return _compat.quickly_compiled(lambda y: x * y)(2.0)
+        return compiled(lambda y: x * y, quickly=True)(2.0)
 
     assert jax.grad(captured)(x) == 2
 
@@ -361,8 +362,44 @@ def test_a_function_with_an_error_of_its_own_is_called_once():
         raise ValueError("other")
 
     with pytest.raises(ValueError, match="other"):
-        _compat.quickly_compiled(wrong)(jnp.ones(()))
+        compiled(wrong, quickly=True)(jnp.ones(()))
     assert len(calls) == 1
+
+
+def test_numbers_in_a_program_can_be_made_constants():
+    closed = jax.make_jaxpr(lambda x: 0.3 * x + 0.7)(1.0)
+    places = [
+        (k, place)
+        for k, eqn in enumerate(closed.jaxpr.eqns)
+        for place, x in enumerate(eqn.invars)
+        if isinstance(x, _compat.Literal)
+    ]
+    jaxpr = _compat.with_constants_for(closed.jaxpr, places)
+    (result,) = _compat.evaluated(jaxpr, [jnp.array(2.0), jnp.array(5.0)], [3.0])
+    assert result == 11
+
+
+def test_rules_and_callbacks_are_told_from_values():
+    square = jax.custom_jvp(lambda x: x**2)
+    square.defjvp(lambda x, dx: (x[0] ** 2, 3 * dx[0]))
+    callback = lambda x: jax.pure_callback(np.sin, x, x)
+    for fn, has_rule in ((square, True), (callback, True), (jax.jit(jnp.sin), False)):
+        (eqn,) = jax.make_jaxpr(fn)(1.0).eqns
+        assert any(map(_compat.is_rule, eqn.params.values())) is has_rule
+
+
+def test_traces_are_used_again_where_they_were_made_only():
+    calls = []
+
+    @jax.jit
+    def inner(x):
+        calls.append(x)
+        return x
+
+    for number in (1, 1, 2, 1):
+        with _compat.with_traces_of(number):
+            jax.make_jaxpr(lambda x: inner(x))(1.0)
+    assert len(calls) == 2
 
 
 def test_traced_programs_tell_literals_and_what_they_call():
