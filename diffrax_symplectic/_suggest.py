@@ -179,12 +179,12 @@ def suggest_solver(
     given_terms = with_paths_for_shapes(terms, WeakBrownianPath)
     terms = without_constraint(given_terms)
     _check_noise(terms)
+    check_drifts_differ(terms)
     check_state("suggest_solver", y0)
     t0 = jnp.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
     terms = with_programs(terms, t0, y0, args)
     drift, noise = split_terms(terms)
     check_terms_fit_state(terms, t0, y0, args)
-    check_drifts_differ(terms)
     check_baths_have_own_noise(terms)
     check_assertions(terms, t0, y0, args)
     constrained = constraint_of(given_terms) is not None

@@ -31,6 +31,7 @@ from .choose import trial_key
 from .estimate import combined_results, Expectation
 from .fitted import ValueFunctions
 from .independent import IndependentPaths
+from .long_steps import may_miss_rotations
 from .run import run
 from .sampling import AbstractSampling
 
@@ -45,8 +46,8 @@ _PART_BEYOND_FIRST = 32
 # Fewer paths than this do not know their own spread, and more would take longer than the
 # estimate.
 _FEWEST_PATHS = 32
-# The same for a trial by the sampling of an estimate, where more samples are as good as a
-# smaller change.
+# A trial with value functions takes these parts of the samples of an estimate, the second
+# if the first is too noisy.
 _PARTS_OF_SAME_SAMPLING = 8, 2
 # A change is sure if it is this many standard errors from zero: by chance that happens once
 # in 370 times for a single mean, and hardly more often for the largest of many.
@@ -79,26 +80,26 @@ def trial_with_finer_level(
     Two levels are wrong and agree where both miss what happens in shorter times, such as a
     rotation, a close encounter or a decay, and by chance where phases are lost.
 
-    A trial has to be about as accurate as the estimate. So paths with value functions are
-    taken again with half the steps, by the programs that are compiled already. Of other
-    samplings a trial has few paths, each with the same noise on all levels where the solver
-    allows it, so that their differences vary little; where these vary too much all the same
-    sorted paths are taken again, too."""
+    A trial has few paths, each with the same noise on all levels where the solver allows
+    it, so that their differences vary little. That does not suffice next to value functions
+    where steps miss a rotation: there paths with value functions are taken again with half
+    the steps, by the programs that are compiled already. It takes twice as long as the
+    estimate."""
     if any(map(has_unknown_law, brownian_paths(problem.terms))):
         return Trial()
     key = trial_key(key)
     arguments = estimate, problem, key, devices
-    changes = None
-    if not isinstance(sampling, ValueFunctions):
+    is_fitted = isinstance(sampling, ValueFunctions)
+    if is_fitted and may_miss_rotations(problem.with_any_steps()):
+        changes = _changes_by_same_sampling(*arguments, sampling)
+    else:
         changes = _changes_on_same_noise(*arguments)
-    is_hidden = changes is None or not changes.are_sure and changes.are_hidden
-    if is_hidden and not isinstance(sampling, IndependentPaths):
-        changes = _changes_by_same_sampling(*arguments, sampling) or changes
     if changes is None:
         return Trial()
     if changes.are_sure:
         return Trial(message=_message(changes, float(problem.levels.h[-1]) / 2))
-    if changes.are_hidden:
+    # Noise next to value functions is always larger, which says little of resolved steps.
+    if changes.are_hidden and not is_fitted:
         return Trial(caveat=_caveat(changes))
     return Trial()
 
@@ -220,6 +221,9 @@ def _changes_by_same_sampling(
 
 def _numbers_of_paths(estimate: Expectation) -> list[int]:
     """The numbers of paths of the trial of an estimate."""
+    # The fits of value functions take far longer than their paths.
+    if isinstance(estimate.sampling, ValueFunctions):
+        return list(_NUMBERS_OF_PATHS)
     first, *others = _NUMBERS_OF_PATHS
     first = min(first, estimate.num_paths // _PART)
     if first < _FEWEST_PATHS:

@@ -38,7 +38,6 @@ from .._terms import (
     brownian_paths,
     call_user_function,
     check_baths_have_own_noise,
-    check_drifts_differ,
     check_terms_fit_state,
     has_lifted,
 )
@@ -170,9 +169,8 @@ def check_finite(y0: Y) -> None:
 
 
 def check_noise(terms: PyTree) -> None:
-    """Raises a `ValueError` if nothing in the terms is random, or if they hold one drift
-    or one noise twice."""
-    check_drifts_differ(terms)
+    """Raises a `ValueError` if nothing in the terms is random, or if they hold one noise
+    twice."""
     check_baths_have_own_noise(terms)
     paths = brownian_paths(terms)
     if len(paths) == 0:

@@ -37,6 +37,7 @@ from .._solver import AbstractSymplecticSolver, check_resolution, own_path, Want
 from .._terms import (
     brownian_paths,
     check_assertions,
+    check_drifts_differ,
     check_start,
     check_stratonovich,
     constraint_of,
@@ -158,6 +159,7 @@ class Problem(eqx.Module):
         if y0_of is None:
             check_finite(y0)
 
+        check_drifts_differ(terms)
         # Times have the dtype of the state.
         t0_of_dtype = np.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
 
