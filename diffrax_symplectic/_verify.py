@@ -19,6 +19,7 @@ from ._terms import (
     apply_one,
     as_spins,
     check_baths_have_own_noise,
+    check_drifts_differ,
     check_unconstrained,
     constraint_of,
     from_spinors,
@@ -36,6 +37,8 @@ from ._terms import (
 
 def _one_step(terms, solver, t0, t1, y0, args) -> tuple[Y, diffrax.RESULTS]:
     """The end of one step, and whether it succeeded."""
+    # Programs do not tell which functions they come from.
+    check_drifts_differ(terms)
     terms = with_programs(terms, t0, y0, args)
     solver = with_programs(solver, t0, y0, args)
     # `diffrax.diffeqsolve` is not used: its loop takes longer to trace than the step.

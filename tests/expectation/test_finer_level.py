@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import lineax as lx
+import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation.finer_level import _caveat, _Changes
 
 
 def _told(*given, **options):
@@ -205,10 +207,23 @@ def test_a_rotation_that_steps_resolve_is_not_told():
     assert message is None
 
 
-def test_what_a_trial_could_not_see_is_printed():
-    few = ds.IndependentPaths(2000)
-    got, message = _of_oscillator(1.0, t1=10, sampling=few)
-    if message is None:
-        assert "would have shown an error of the step above" in str(got)
-    many, _ = _of_oscillator(0.05, t1=1, sampling=few)
-    assert many.caveat == ""
+def test_changes_that_noise_would_hide_are_told_apart_from_those_that_are_sure():
+    def changes(size, noise):
+        return _Changes(
+            sizes=np.array([0.0, size]),
+            noise=np.array([1e-6, noise]),
+            errors=np.array([0.01, 0.01]),
+            num_paths=512,
+        )
+
+    seen = changes(0.2, 0.01)
+    hidden = changes(0.02, 0.02)
+    small = changes(0.005, 0.001)
+    assert seen.are_sure
+    assert not hidden.are_sure and hidden.are_hidden
+    assert not small.are_sure and not small.are_hidden
+    # 3.2 standard errors, for the larger of two changes.
+    assert (
+        "on 512 paths, would have shown an error of the step above 6.5e-02"
+        in _caveat(hidden)
+    )
