@@ -206,7 +206,7 @@ def check_memory(
         )
 
 
-def _memory_of(device: Any) -> float:
+def _memory_of(device: Any) -> int | float:
     """The memory of a device in bytes, or infinity if that is not known."""
     if device is not None and device.platform != "cpu":
         statistics = device.memory_stats() or {}

@@ -156,7 +156,7 @@ class _Program:
         return eqx.combine(self.treedef.unflatten(results), self.static)
 
 
-def _converted(x: Any, aval: Any) -> Array:
+def _converted(x: Any, aval: Any) -> Array | np.ndarray:
     has_dtype = eqx.is_array(x) and x.dtype == aval.dtype
     return x if has_dtype else jnp.asarray(x, aval.dtype)
 
@@ -263,7 +263,7 @@ def _described_value(x: Any, rules: list[Any]) -> Hashable:
     return type(x), x
 
 
-def _array_value(x: Array | np.ndarray) -> Hashable:
+def _array_value(x: Array | np.ndarray | np.generic) -> Hashable:
     """The values of an array, with its shape and dtype."""
     is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
     words = jax.random.key_data(x) if is_key else x
