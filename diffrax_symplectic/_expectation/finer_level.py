@@ -154,8 +154,8 @@ def _message(changes: _Changes, h: float) -> str:
 def _caveat(changes: _Changes) -> str:
     worst = np.argmax(changes.visible / changes.errors)
     return (
-        f"a trial with half the steps, on {changes.num_paths:,} paths, would have shown an "
-        f"error of the step above {changes.visible[worst]:.1e} (see `levels`)"
+        f"a trial with half the steps, on {changes.num_paths:,} paths, would have shown a "
+        f"change of the mean above {changes.visible[worst]:.1e} (see `levels`)"
     )
 
 

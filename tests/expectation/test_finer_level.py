@@ -224,6 +224,6 @@ def test_changes_that_noise_would_hide_are_told_apart_from_those_that_are_sure()
     assert not small.are_sure and not small.are_hidden
     # 3.2 standard errors, for the larger of two changes.
     assert (
-        "on 512 paths, would have shown an error of the step above 6.4e-02"
+        "on 512 paths, would have shown a change of the mean above 6.4e-02"
         in _caveat(hidden)
     )
