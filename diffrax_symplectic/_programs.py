@@ -265,8 +265,9 @@ def _described_value(x: Any, rules: list[Any]) -> Hashable:
 
 def _array_value(x: Array | np.ndarray | np.generic) -> Hashable:
     """The values of an array, with its shape and dtype."""
-    is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-    words = jax.random.key_data(x) if is_key else x
+    words = x
+    if isinstance(x, Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+        words = jax.random.key_data(x)
     return x.shape, str(x.dtype), np.asarray(words).tobytes()
 
 
