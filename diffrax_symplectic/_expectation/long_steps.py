@@ -9,6 +9,7 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
+import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
@@ -18,7 +19,7 @@ from .._compat import unwrapped
 from .._custom_types import Terms
 from .._programs import compiled, once_for_each_signature
 from .._simulation import Problem
-from .._solver import AbstractSymplecticSolver
+from .._solver import AbstractLangevinSplitting, AbstractSymplecticSolver
 from .._terms import (
     apply,
     BathNoise,
@@ -59,6 +60,19 @@ _NUM_DIRECTIONS = 4
 # more than what they miss. Measured for a charge in a magnetic field by
 # `BAOAB(ImplicitMidpoint())`: within 0.3 bars up to an angle of 2.4, 24 off at 4.8.
 _RESOLVED = 1.2
+# An implicit step takes a mode that turns by the angle omega h toward its mean by
+# 1 + (omega h / 2)^2 times less than its decay: less than half of it from here on. Measured
+# for an oscillator with friction by `ImplicitMidpoint`: two levels and a trial see it up to
+# omega h = 60, and at 200 all levels keep the energy of the start.
+_TURNS_TOO_FAR_TO_DECAY = 2.0
+# A mode that loses less than this part of its amplitude over the interval has no decay to
+# miss.
+_LEAST_DECAY = 0.01
+# Rates of decay below this part of a frequency may be rounding, in single precision.
+_ROUNDING = 1e-6
+# The largest number of numbers in a state of which all modes are known: the eigenvalues of
+# 256 take 0.1 s.
+_MOST_MODES = 256
 # The number of steps to look at where the drift depends on time.
 _NUM_TIMES = 64
 # Multiples of this number, without their whole parts, fill an interval evenly, and a drift
@@ -86,8 +100,9 @@ def too_long_steps(problem: Problem, dt0: float) -> str | None:
     `None` if nothing is, or for solvers of others. Two levels need not show it.
 
     Explicit solvers must be stable, with increments of zero. A solver with a
-    `Record.most_frequency` must resolve the frequencies of the drift. If the drift depends
-    on time, this looks at steps from all over the interval, and otherwise at the first.
+    `Record.most_frequency` must resolve the frequencies of the drift, and every implicit
+    one those that decay. If the drift depends on time, this looks at steps from all over
+    the interval, and otherwise at the first.
 
     This sees the frequencies at `y0` alone. A look at the states of a path without noise,
     too, did not find steps of a thirtieth of the period too long on an ellipse of
@@ -102,11 +117,11 @@ def too_long_steps(problem: Problem, dt0: float) -> str | None:
     most = None if solver.record is None else solver.record.most_frequency
     # Three levels are checked for the order, which shows this.
     is_checked = len(problem.levels.h) > 2
-    return (
-        None
-        if most is None or is_checked
-        else _unresolved_frequency(problem, dt0, most)
-    )
+    if most is not None and not is_checked:
+        message = _unresolved_frequency(problem, dt0, most)
+        if message is not None:
+            return message
+    return _lost_decay(problem, dt0)
 
 
 def _instability(problem: Problem, dt0: float) -> str | None:
@@ -139,6 +154,35 @@ def _unresolved_frequency(problem: Problem, dt0: float, most: float) -> str | No
         f"{place}: omega h = {angles[largest]:.3g} for the largest frequency of the drift, "
         f"and with omega h > {most:g} two levels may agree on a wrong mean. Pass a smaller "
         "`dt0`, or `levels=3`, which checks the order."
+    )
+
+
+def _lost_decay(problem: Problem, dt0: float) -> str | None:
+    """`too_long_steps` for an implicit solver and modes that decay slowly and turn far in a
+    step: it keeps them, on every level."""
+    numbers = _numbers_of_steps(problem)
+    angles = np.asarray(_quick_frequencies(problem, numbers)) * dt0
+    if not np.max(angles) > _TURNS_TOO_FAR_TO_DECAY:
+        return None
+    num_modes = sum(np.size(leaf) for leaf in jtu.tree_leaves(problem.y0))
+    if num_modes > _MOST_MODES:
+        return None
+    number = numbers[np.argmax(angles)]
+    rates = np.linalg.eigvals(np.asarray(_quick_modes(problem, number), float))
+    duration = float(problem.level(0).num_steps) * dt0
+    # Rounding, and modes of a Hamiltonian that grow and decay in pairs, are no decay.
+    least_rate = max(_LEAST_DECAY / duration, _ROUNDING * np.max(np.abs(rates)))
+    is_kept = np.abs(rates.imag) * dt0 > _TURNS_TOO_FAR_TO_DECAY
+    is_kept &= -rates.real > least_rate
+    if not np.any(is_kept) or not -np.sum(rates.real) > least_rate:
+        return None
+    angle = np.max(np.abs(rates.imag[is_kept])) * dt0
+    return (
+        f"Steps of `dt0={dt0:g}` are too long for `{type(problem.solver).__name__}` "
+        f"{_place(problem, number)}: a mode with omega h = {angle:.3g} decays, and "
+        f"implicit steps that turn it by more than {_TURNS_TOO_FAR_TO_DECAY:g} keep it, so "
+        "that it relaxes far too slowly on every level. Pass a smaller `dt0`, or for "
+        "Langevin terms `BAOAB(ImplicitMidpoint())`, which solves the friction by itself."
     )
 
 
@@ -303,6 +347,22 @@ def _frequencies(
     return lax.map(frequency, numbers)
 
 
+def _modes(problem: Problem, number: Float[Array, ""]) -> Float[Array, "n n"]:
+    """The derivative at `y0` of the drift that a step solves as a whole: with friction,
+    unless a splitting solves it apart. At the start of the step with this number."""
+    drift, friction, _ = split_friction(problem.terms)
+    if isinstance(problem.solver, AbstractLangevinSplitting):
+        friction = ()
+    t = problem.t0 + number * problem.level(0).h
+    flat_y0, unravel = jfu.ravel_pytree(problem.y0)
+
+    def rate_of_drift(x: Array) -> Array:
+        dy = rate((*drift, *friction), t, unravel(x), problem.args)
+        return jfu.ravel_pytree(dy)[0]
+
+    return jax.jacfwd(rate_of_drift)(flat_y0)
+
+
 def _noise_frequency(problem: Problem) -> Float[Array, ""]:
     """The angle by which noise turns a change of the state at `y0` within time 1, as a
     standard deviation: the largest over some random directions of the noise, in which all
@@ -370,5 +430,6 @@ def _largest_growth(
 
 _quick_growth = compiled(_growth, quickly=True)
 _quick_frequencies = compiled(_frequencies, quickly=True)
+_quick_modes = compiled(_modes, quickly=True)
 _quick_noise_frequency = compiled(_noise_frequency, quickly=True)
 _quick_short_step_succeeds = compiled(_short_step_succeeds, quickly=True)

@@ -346,3 +346,104 @@ def test_noise_that_turns_nothing_is_always_resolved():
         )
     bath = ds.langevin_terms(oscillator, 100.0, 10.0, (1,))
     assert _noise_told(bath, one, 1.0) is None
+
+
+OMEGA = 200.0
+LOSS = 0.04
+
+
+def _fast_energy(t, p, q, args):
+    return args * (p**2 + q**2) / 2
+
+
+def _with_loss(t, y, args):
+    """The drift of the same oscillator with its loss written into it."""
+    p, q = y
+    return -args * q - LOSS * p, args * p
+
+
+def _energy(t, y, args):
+    p, q = y
+    return (p**2 + q**2) / 2
+
+
+def _mean_energy(terms, solver, omega=OMEGA, scale=1.0, **options):
+    """The mean energy after 100 steps from an energy of 12.5, and whether a warning tells
+    that it decays too slowly. In units of energy in which the temperature is one."""
+    y0 = jnp.array(0.0), jnp.array(5.0)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        got = ds.expectation(
+            _energy,
+            terms,
+            solver,
+            0,
+            100 * scale,
+            scale,
+            y0,
+            omega / scale,
+            key=jr.key(3),
+            sampling=FEW,
+            **options,
+        )
+    return got, any("relaxes far too slowly" in str(x.message) for x in told)
+
+
+# By the matrix exponential of the drift, to all of these digits.
+RIGHT_ENERGY = 1.2106
+
+
+@pytest.mark.parametrize("options", [{}, dict(levels=3)])
+def test_implicit_steps_that_keep_what_decays_are_told(options):
+    terms = ds.langevin_terms(_fast_energy, LOSS / OMEGA, OMEGA, ())
+    got, told = _mean_energy(terms, ds.ImplicitMidpoint(), **options)
+    assert got.mean > 10 * RIGHT_ENERGY
+    assert told
+
+
+def test_a_loss_written_into_the_drift_is_told():
+    noise = lambda t, p, q, args: -((2 * LOSS) ** 0.5) * q
+    kick = ds.noise_terms(noise, ())
+    terms = diffrax.MultiTerm(diffrax.ODETerm(_with_loss), kick)
+    got, told = _mean_energy(terms, ds.ImplicitMidpoint())
+    assert got.mean > 10 * RIGHT_ENERGY
+    assert told
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e6])
+def test_decay_of_a_fast_mode_is_told_in_every_unit_of_time(scale):
+    terms = ds.langevin_terms(_fast_energy, LOSS / OMEGA, OMEGA, ())
+    assert _mean_energy(terms, ds.ImplicitMidpoint(), scale=scale)[1]
+
+
+def test_friction_that_a_splitting_solves_apart_is_right_and_not_told():
+    terms = ds.langevin_terms(_fast_energy, LOSS / OMEGA, OMEGA, ())
+    got, told = _mean_energy(terms, ds.BAOAB(ds.ImplicitMidpoint()))
+    assert abs(got.mean - RIGHT_ENERGY) < 4 * got.error
+    assert not told
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_rounding_and_a_turning_saddle_are_no_decay(dtype):
+    def turning_saddle(t, p, q, args):
+        # The rates of its modes are (+-1 +- 3 i) args: what decays also grows.
+        return args * (p @ q + 3 * p[0] * q[1] - 3 * p[1] * q[0])
+
+    kick = lambda t, p, q, args: q[0] / 100
+    fast_pair = lambda t, p, q, args: args * (p @ p + q @ q) / 2 + q[0] * q[1]
+    y0 = jnp.zeros(2, dtype), jnp.ones(2, dtype)
+    for H0 in (turning_saddle, fast_pair):
+        terms = ds.hamiltonian_terms(H0, kick, ())
+        problem = Problem.of(
+            lambda t, y, args: y[1][0],
+            terms,
+            ds.ImplicitMidpoint(),
+            0,
+            1e4,
+            1.0,
+            y0,
+            OMEGA,
+            None,
+            2,
+        )
+        assert too_long_steps(problem, 1.0) is None
