@@ -28,7 +28,7 @@ from .._terms import (
     with_paths,
 )
 from .choose import trial_key
-from .estimate import combined_results, Expectation
+from .estimate import combined_results, Expectation, label_of
 from .fitted import ValueFunctions
 from .independent import IndependentPaths
 from .long_steps import may_miss_rotations
@@ -97,7 +97,7 @@ def trial_with_finer_level(
     if changes is None:
         return Trial()
     if changes.are_sure:
-        return Trial(message=_message(changes, float(problem.levels.h[-1]) / 2))
+        return Trial(message=_message(estimate, changes, problem.levels.h[-1] / 2))
     # Noise next to value functions is always larger, which says little of resolved steps.
     if changes.are_hidden and not is_fitted:
         return Trial(caveat=_caveat(changes))
@@ -140,11 +140,11 @@ class _Changes(NamedTuple):
         return bool(np.any(self.visible > self.errors))
 
 
-def _message(changes: _Changes, h: float) -> str:
-    worst = np.argmax(changes.excess)
+def _message(estimate: Expectation, changes: _Changes, h: np.floating) -> str:
+    worst = int(np.argmax(changes.excess))
     return (
         f"Steps are too long: on {changes.num_paths} paths of a trial, a third level, with "
-        f"steps of {h:.3g}, changes a mean by {changes.sizes[worst]:.2g} ± "
+        f"steps of {h:.3g}, changes a mean{label_of(estimate, worst)} by {changes.sizes[worst]:.2g} ± "
         f"{changes.noise[worst]:.1g}, which is more than its error, "
         f"{changes.errors[worst]:.1g}. Pass a smaller `dt0`, or `tol`, which takes smaller "
         "steps until they fit the order."

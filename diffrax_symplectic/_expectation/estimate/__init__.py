@@ -13,6 +13,7 @@ from .estimate import (
     combined_results,
     Expectation,
     ExpectationInterrupted,
+    label_of,
 )
 from .moments import combined_in_halves, Moments, total
 from .tolerance import is_reached, is_stuck, largest_error, needs_level, share_of_needed

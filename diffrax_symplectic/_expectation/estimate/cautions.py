@@ -10,7 +10,7 @@ import numpy as np
 from ..._simulation import Combination
 from ..sampling import ROUNDING
 from .error_bars import least_deviation, share_of_largest
-from .estimate import combined_results, Expectation, labels
+from .estimate import combined_results, Expectation, label_of
 from .moments import total
 from .tolerance import largest_error, shortfall
 
@@ -103,9 +103,10 @@ def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
         share = share_of_largest(r, n)
         yield (
             f"One path in {n:,} accounts for {share:.0%} of the variance"
-            f"{_label(estimate, place)}: still rarer paths may contribute much to the "
-            "mean, and the standard error may be too small. Take many more paths. If `phi` "
-            "grows fast, average a function that grows more slowly."
+            f"{label_of(estimate, place)}: still rarer paths may contribute much to the "
+            "mean, and the standard error may be too small. If forces are steep, steps may "
+            "be too long on such paths: pass a smaller `dt0`. If `phi` grows fast, average "
+            "a function that grows more slowly, or take many more paths."
         )
 
 
@@ -120,12 +121,6 @@ def _place_of_largest(values: Any) -> int:
 
 def _flat(tree: Any) -> np.ndarray:
     return np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(tree)])
-
-
-def _label(estimate: Expectation, place: int) -> str:
-    """Which of several numbers of the mean this is, for messages."""
-    label = labels(estimate)[place]
-    return f" ({label})" if label else ""
 
 
 def _cautions_on_samples(estimate: Expectation) -> Iterator[str]:
@@ -183,7 +178,7 @@ def _cautions_on_steps(estimate: Expectation) -> Iterator[str]:
     place = _place_of_largest(ratios)
     if _flat(ratios)[place] > 0:
         yield (
-            f"The first two steps do not agree{_label(estimate, place)}: extrapolation "
+            f"The first two steps do not agree{label_of(estimate, place)}: extrapolation "
             "from steps of `dt0` and half of it changes the mean from "
             f"{_flat(finest)[place]:.3g} to {_flat(estimate.mean)[place]:.3g}. Pass a "
             "smaller `dt0`, or `levels=3`, which checks the order."

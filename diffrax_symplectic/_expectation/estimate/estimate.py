@@ -442,6 +442,13 @@ def labels(estimate: Expectation) -> list[str]:
     return found
 
 
+def label_of(estimate: Expectation, place: int) -> str:
+    """Which number of the mean stands at this place, in brackets; the empty string for a
+    single number."""
+    label = labels(estimate)[place]
+    return f" ({label})" if label else ""
+
+
 def _rounded(mean: float, error: float) -> str:
     """The mean, rounded to two digits of its error: `0.364083` for an error of 8.6e-05,
     `4.372e-44` for one of 1.2e-46."""
