@@ -97,7 +97,8 @@ def trial_with_finer_level(
     if changes is None:
         return Trial()
     if changes.are_sure:
-        return Trial(message=_message(estimate, changes, problem.levels.h[-1] / 2))
+        h = float(problem.levels.h[-1]) / 2
+        return Trial(message=_message(estimate, changes, h))
     # Noise next to value functions is always larger, which says little of resolved steps.
     if changes.are_hidden and not is_fitted:
         return Trial(caveat=_caveat(changes))
@@ -140,13 +141,13 @@ class _Changes(NamedTuple):
         return bool(np.any(self.visible > self.errors))
 
 
-def _message(estimate: Expectation, changes: _Changes, h: np.floating) -> str:
+def _message(estimate: Expectation, changes: _Changes, h: float) -> str:
     worst = int(np.argmax(changes.excess))
     return (
         f"Steps are too long: on {changes.num_paths} paths of a trial, a third level, with "
-        f"steps of {h:.3g}, changes a mean{label_of(estimate, worst)} by {changes.sizes[worst]:.2g} ± "
-        f"{changes.noise[worst]:.1g}, which is more than its error, "
-        f"{changes.errors[worst]:.1g}. Pass a smaller `dt0`, or `tol`, which takes smaller "
+        f"steps of {h:.3g}, changes a mean{label_of(estimate, worst)} by "
+        f"{changes.sizes[worst]:.2g} ± {changes.noise[worst]:.1g}, which is more than its "
+        f"error, {changes.errors[worst]:.1g}. Pass a smaller `dt0`, or `tol`, which takes smaller "
         "steps until they fit the order."
     )
 
