@@ -147,8 +147,8 @@ def _message(estimate: Expectation, changes: _Changes, h: float) -> str:
         f"Steps are too long: on {changes.num_paths} paths of a trial, a third level, with "
         f"steps of {h:.3g}, changes a mean{label_of(estimate, worst)} by "
         f"{changes.sizes[worst]:.2g} ± {changes.noise[worst]:.1g}, which is more than its "
-        f"error, {changes.errors[worst]:.1g}. Pass a smaller `dt0`, or `tol`, which takes smaller "
-        "steps until they fit the order."
+        f"error, {changes.errors[worst]:.1g}. Pass a smaller `dt0`, or `tol`, which takes "
+        "smaller steps until they fit the order."
     )
 
 
