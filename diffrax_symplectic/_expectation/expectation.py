@@ -44,7 +44,8 @@ from .jumps import jumps_at_step_ends, jumps_within_steps
 from .kinks import has_kinks
 from .long_steps import may_be_too_long, too_long_steps, unresolved_noise
 from .out_of_range import out_of_range
-from .run import Kept, Meter, NO_METER, run
+from .progress import NO_METER, Progress
+from .run import Kept, run
 from .sampling import AbstractSampling
 from .strong_friction import unresolved_friction
 
@@ -53,6 +54,8 @@ from .strong_friction import unresolved_friction
 # and with `tol` at most so many, the last of which has steps of `dt0 / 32`.
 _FEWEST_LEVELS = 2
 _MOST_LEVELS = 6
+# Without fits, levels and checks of the steps there is one program.
+_QUICK_LOOK = "`sampling=IndependentPaths(1000)` and `levels=1`"
 # Two means count as different if they are this many standard errors apart: by chance that
 # happens once in sixteen thousand times.
 _SURE_OF_LAW = 4
@@ -154,7 +157,8 @@ def expectation(
     - `devices`: the devices that share the work, by default all of `jax.devices()`. Under
         `jax.distributed` these include the devices of every process; each process must make
         the same call, and gets the same result.
-    - `progress_meter`: a Diffrax progress meter.
+    - `progress_meter`: a Diffrax progress meter. Without one, a call that takes more than
+        five seconds prints once to `sys.stderr` what it is doing.
 
     **Returns:** an [`diffrax_symplectic.Expectation`][]. A path fails if the solver reports
     a failed step, or if its state or $\phi$ is not finite. Failed paths are excluded, and
@@ -200,23 +204,26 @@ def expectation(
         Problem.of, phi, terms, solver, t0, t1, dt0, y0, args, ts, key=key
     )
     times = None if ts is None else np.array(ts, float).reshape(-1)
+    progress = Progress("expectation", progress_meter, _QUICK_LOOK)
     # The looks and trials after the last sample may be interrupted, too.
-    with ShortTraceback(), Kept() as kept:
-        with Meter(progress_meter) as meter:
-            while True:
-                problem, used_sampling, plan = choose(
-                    ft.partial(problem_of, levels), request
-                )
-                estimate = run(
-                    plan, key, devices, used_sampling, start, first, tol, meter, times,
-                    kept,
-                )  # fmt: skip
-                if tol is None or not may_add_levels or levels == _MOST_LEVELS:
-                    break
-                if not needs_level(estimate, tol):
-                    break
-                levels += 1
+    with ShortTraceback(), Kept() as kept, progress:
+        while True:
+            progress.stage("compiling and fitting")
+            problem, used_sampling, plan = choose(
+                ft.partial(problem_of, levels), request
+            )
+            progress.stage(f"compiling and sampling with {levels} step sizes")
+            estimate = run(
+                plan, key, devices, used_sampling, start, first, tol, progress, times,
+                kept,
+            )  # fmt: skip
+            if tol is None or not may_add_levels or levels == _MOST_LEVELS:
+                break
+            if not needs_level(estimate, tol):
+                break
+            levels += 1
 
+        progress.stage("checking the steps")
         advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
         # `num_paths` are those that did not fail.
         most_fail = estimate.num_failed > estimate.num_paths
@@ -248,7 +255,7 @@ def expectation(
             # A trial takes longer than these looks, which name the cause.
             if estimate.levels == 2 and not messages:
                 trial = trial_with_finer_level(
-                    estimate, problem, used_sampling, key, devices
+                    estimate, problem, used_sampling, plan.is_fit_quick, key, devices
                 )
                 estimate = dataclasses.replace(estimate, caveat=trial.caveat)
                 messages += [] if trial.message is None else [trial.message]

@@ -72,6 +72,7 @@ def trial_with_finer_level(
     estimate: Expectation,
     problem: Problem,
     sampling: AbstractSampling,
+    is_fit_quick: bool,
     key: PRNGKeyArray,
     devices: Devices,
 ) -> Trial:
@@ -81,16 +82,16 @@ def trial_with_finer_level(
     rotation, a close encounter or a decay, and by chance where phases are lost.
 
     A trial has few paths, each with the same noise on all levels where the solver allows
-    it, so that their differences vary little. That does not suffice next to value functions
-    where steps miss a rotation: there paths with value functions are taken again with half
-    the steps, by the programs that are compiled already. It takes twice as long as the
-    estimate."""
+    it, so that their differences vary little. Next to value functions their noise hides
+    changes of a hundred errors. So where a fit is quick, or steps may miss a rotation,
+    paths with value functions are taken again with half the steps, by the programs that are
+    compiled already. It takes twice as long as the fit of the estimate."""
     if any(map(has_unknown_law, brownian_paths(problem.terms))):
         return Trial()
     key = trial_key(key)
     arguments = estimate, problem, key, devices
     is_fitted = isinstance(sampling, ValueFunctions)
-    if is_fitted and may_miss_rotations(problem.with_any_steps()):
+    if is_fitted and (is_fit_quick or may_miss_rotations(problem.with_any_steps())):
         changes = _changes_by_same_sampling(*arguments, sampling)
     else:
         changes = _changes_on_same_noise(*arguments)

@@ -30,7 +30,8 @@ from .._simulation import (
 from .call import checked_call
 from .estimate import cautions, Expectation
 from .independent import IndependentPaths
-from .run import Kept, Meter, NO_METER, run
+from .progress import NO_METER, Progress
+from .run import Kept, run
 from .sampling import Averaged, Samples
 
 
@@ -125,7 +126,8 @@ def monte_carlo(
         raise ValueError(f"`order` must be a positive integer, or 1/2; got {order!r}.")
     sampling = IndependentPaths(num_paths, batch_size)
     weights = level_weights(float(order or 1), levels)
-    with ShortTraceback(), Kept() as kept:
+    progress = Progress("monte_carlo", progress_meter, "a small `num_paths`")
+    with ShortTraceback(), Kept() as kept, progress:
         # A level is a Python integer, by which a function may choose its step, so each
         # level is a program of its own.
         with current_traces(fn):
@@ -139,10 +141,10 @@ def monte_carlo(
         bytes_of_path = 4 * levels
         plan = sampling.plan(sampler, levels, devices, bytes_of_path)
         plan = plan._replace(digests=dict(fn=digest(programs), order=digest(order)))
-        with Meter(progress_meter) as meter:
-            estimate = run(
-                plan, key, devices, sampling, start, first, tol, meter, kept=kept
-            )
+        progress.stage("compiling and sampling")
+        estimate = run(
+            plan, key, devices, sampling, start, first, tol, progress, kept=kept
+        )
         advice = advice_on_failures(has_bounded_increments=False, is_implicit=False)
         for message in cautions(estimate, tol, advice):
             warnings.warn(message, stacklevel=2)

@@ -5,7 +5,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.random as jr
@@ -27,28 +26,8 @@ from .estimate import (
     Moments,
     share_of_needed,
 )
+from .progress import Progress
 from .sampling import MOST_SAMPLES, Samples, SamplingPlan
-
-
-NO_METER = diffrax.NoProgressMeter()
-
-
-class Meter:
-    """A progress meter of Diffrax, as a context manager."""
-
-    def __init__(self, meter: diffrax.AbstractProgressMeter):
-        self._meter = meter
-        self._state = meter.init()
-
-    def step(self, progress: float) -> None:
-        """Shows the progress, from 0 to 1."""
-        self._state = self._meter.step(self._state, np.asarray(progress))
-
-    def __enter__(self) -> "Meter":
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._meter.close(self._state)
 
 
 class Kept:
@@ -76,7 +55,7 @@ def run(
     start: Expectation | None = None,
     first: int = 0,
     tol: float | None = None,
-    meter: Meter | None = None,
+    progress: Progress | None = None,
     ts: np.ndarray | None = None,
     kept: Kept | None = None,
 ) -> Expectation:
@@ -143,9 +122,9 @@ def run(
                     estimate, device_moments, batches.size, end, no_moments.dtypes
                 )
                 kept.estimate = estimate
-            if meter is not None:
+            if progress is not None:
                 share = (_end_of(estimate) - begin) / plan.num_samples
-                meter.step(max(share, share_of_needed(estimate, tol)))
+                progress.step(max(share, share_of_needed(estimate, tol)))
         elif not starts_batch:
             break
     if tol is not None:

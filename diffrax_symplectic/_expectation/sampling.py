@@ -83,6 +83,7 @@ class SamplingPlan(NamedTuple):
         without a trace.
     - `is_quick`: whether the samples take less time than compiling their program, which is
         then compiled for speed of compilation.
+    - `is_fit_quick`: whether the plan holds a fit that took less time than this.
     - `tails`, `rounding_floor`, `digests`: as in `Expectation`.
     - `simulate_paths`: for paths computed outside JAX, maps the number of the first sample
         and the number of samples to an argument that the sampler takes before the keys.
@@ -98,6 +99,7 @@ class SamplingPlan(NamedTuple):
     remainder: float = 0.0
     struct: Averaged | None = None
     is_quick: bool = False
+    is_fit_quick: bool = False
     tails: PyTree[np.ndarray] | None = None
     rounding_floor: int = 1
     digests: dict[str, str] | None = None

@@ -33,6 +33,9 @@ _HIGHEST_DEGREE = 8
 _ALWAYS_TRIED_UP_TO = 2
 # The most bytes that a fit may take, so that it fits into machines of 8 GiB.
 _MOST_MEMORY = 4 * 2**30
+# A fit with at most this many entries of states takes less time than compiling a program:
+# XX s.
+_MOST_OF_QUICK_FIT = 2**21
 # The most entries of states that a fit computes without a warning that it will take long
 # (about a minute).
 _MOST_WITHOUT_WARNING = 2**31
@@ -60,6 +63,11 @@ def chosen_basis(problem: Problem, degree: int | None) -> ChosenBasis:
     basis = _basis(problem, degree, num_nodes, total_steps)
     num_states = basis.num_sites * num_nodes
     return ChosenBasis(basis, num_states, num_states * total_steps * basis.d)
+
+
+def is_quick(chosen: ChosenBasis) -> bool:
+    """Whether a fit takes less time than compiling a program."""
+    return chosen.num_entries <= _MOST_OF_QUICK_FIT
 
 
 def warn_of_long_fit(chosen: ChosenBasis, stacklevel: int) -> None:

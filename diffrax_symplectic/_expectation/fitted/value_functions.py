@@ -33,7 +33,7 @@ from ..sampling import (
     saved_by_name,
 )
 from .bases import AbstractBasis
-from .basis_choice import chosen_basis, warn_of_long_fit
+from .basis_choice import chosen_basis, is_quick, warn_of_long_fit
 from .controlled_paths import controlled_paths
 from .fits import Choice, fit, FittedFunctions
 from .noise import Noise
@@ -134,6 +134,7 @@ class ValueFunctions(AbstractSampling):
         ]
         plan = controlled.plan(choice, usual_deviations, own_law, self.num_paths)
         return plan._replace(
+            is_fit_quick=is_quick(chosen),
             reason=_reason(basis, choice),
             tails=largest_tails(tail_trials),
             remainder=comparison.remainder(problem.dtype),
