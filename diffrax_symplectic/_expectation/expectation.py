@@ -254,9 +254,7 @@ def expectation(
             )
             # A trial takes longer than these looks, which name the cause.
             if estimate.levels == 2 and not messages:
-                trial = trial_with_finer_level(
-                    estimate, problem, used_sampling, plan.is_fit_quick, key, devices
-                )
+                trial = trial_with_finer_level(estimate, problem, plan, key, devices)
                 estimate = dataclasses.replace(estimate, caveat=trial.caveat)
                 messages += [] if trial.message is None else [trial.message]
             if has_kinks(problem):

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools as ft
-import warnings
 from typing import NamedTuple
 
 import jax.tree_util as jtu
@@ -13,7 +12,6 @@ from .._custom_types import Devices
 from .._simulation import (
     Combination,
     finer_change_weights,
-    halved,
     has_discrete_increments,
     is_multiple,
     Problem,
@@ -29,11 +27,11 @@ from .._terms import (
 )
 from .choose import trial_key
 from .estimate import combined_results, Expectation, label_of
-from .fitted import ValueFunctions
+from .fitted import ValueFunctions, with_half_steps
 from .independent import IndependentPaths
 from .long_steps import may_miss_rotations
 from .run import run
-from .sampling import AbstractSampling
+from .sampling import SamplingPlan
 
 
 # The numbers of paths of a trial: more are taken only while their noise hides changes as
@@ -71,8 +69,7 @@ class Trial(NamedTuple):
 def trial_with_finer_level(
     estimate: Expectation,
     problem: Problem,
-    sampling: AbstractSampling,
-    is_fit_quick: bool,
+    plan: SamplingPlan,
     key: PRNGKeyArray,
     devices: Devices,
 ) -> Trial:
@@ -85,16 +82,17 @@ def trial_with_finer_level(
     it, so that their differences vary little. Next to value functions their noise hides
     changes of a hundred errors. So where a fit is quick, or steps may miss a rotation,
     paths with value functions are taken again with half the steps, by the programs that are
-    compiled already. It takes twice as long as the fit of the estimate."""
+    compiled already."""
     if any(map(has_unknown_law, brownian_paths(problem.terms))):
         return Trial()
     key = trial_key(key)
-    arguments = estimate, problem, key, devices
-    is_fitted = isinstance(sampling, ValueFunctions)
-    if is_fitted and (is_fit_quick or may_miss_rotations(problem.with_any_steps())):
-        changes = _changes_by_same_sampling(*arguments, sampling)
+    is_fitted = isinstance(estimate.sampling, ValueFunctions)
+    if is_fitted and (
+        plan.is_fit_quick or may_miss_rotations(problem.with_any_steps())
+    ):
+        changes = _changes_by_same_sampling(estimate, plan, key, devices)
     else:
-        changes = _changes_on_same_noise(*arguments)
+        changes = _changes_on_same_noise(estimate, problem, key, devices)
     if changes is None:
         return Trial()
     if changes.are_sure:
@@ -188,19 +186,11 @@ def _changes_on_same_noise(
 
 
 def _changes_by_same_sampling(
-    estimate: Expectation,
-    problem: Problem,
-    key: PRNGKeyArray,
-    devices: Devices,
-    sampling: AbstractSampling,
+    estimate: Expectation, plan: SamplingPlan, key: PRNGKeyArray, devices: Devices
 ) -> _Changes | None:
     """The changes on samples of the same kind with half the steps, as many as it takes;
     `None` if too many fail."""
-    finer_problem = dataclasses.replace(problem, levels=halved(problem.levels))
-    with warnings.catch_warnings():
-        # The plan of the estimate has given the same warnings.
-        warnings.simplefilter("ignore")
-        plan = sampling.prepare(finer_problem, key, devices)
+    plan = with_half_steps(plan, key)
     trial = None
     changes = None
     for part in _PARTS_OF_SAME_SAMPLING:

@@ -14,4 +14,4 @@ choose, `P` polynomials, `K` outcomes of a step. Of random variables there are `
 
 from .basis_choice import MOST_DIMENSIONS_OF_GRID
 from .noise import count_outcomes
-from .value_functions import ValueFunctions
+from .value_functions import ValueFunctions, with_half_steps

@@ -33,8 +33,8 @@ _HIGHEST_DEGREE = 8
 _ALWAYS_TRIED_UP_TO = 2
 # The most bytes that a fit may take, so that it fits into machines of 8 GiB.
 _MOST_MEMORY = 4 * 2**30
-# A fit with at most this many entries of states takes less time than compiling a program:
-# XX s.
+# A fit with at most this many entries of states takes less time than compiling a program.
+# (Where a program of paths took 4.4 s of processor time, a fit with 600,000 took 0.2 s.)
 _MOST_OF_QUICK_FIT = 2**21
 # The most entries of states that a fit computes without a warning that it will take long
 # (about a minute).

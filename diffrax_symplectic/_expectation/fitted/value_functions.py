@@ -8,6 +8,7 @@ $u$. For the exact $u$ the sum of these differences is $\\phi(y_N)$ minus its me
 import dataclasses
 import functools as ft
 import warnings
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,7 +22,7 @@ from ..._arguments import check_memory, check_untraced, whole_number
 from ..._custom_types import Devices
 from ..._lapack import lapack_in_turn
 from ..._programs import compiled
-from ..._simulation import Combination, Problem
+from ..._simulation import Combination, halved, Problem
 from ..._solver import without_newton
 from ..estimate import combined_results, Expectation, total
 from ..run import run
@@ -101,7 +102,7 @@ class ValueFunctions(AbstractSampling):
         struct = problem.sample_struct
         controlled = _ControlledSampling(
             problem,
-            _fits(problem, key, basis),
+            _fits(problem, key, basis, range(len(problem.levels.h))),
             output_shape=problem.output_shape,
             struct=Averaged(struct, plain=struct, control=struct, tails=struct),
             trial_key=jr.fold_in(key, _TRIAL_KEY),
@@ -139,6 +140,19 @@ class ValueFunctions(AbstractSampling):
             tails=largest_tails(tail_trials),
             remainder=comparison.remainder(problem.dtype),
         )
+
+
+def with_half_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
+    """A plan of `ValueFunctions` with half the steps on all levels. It compiles nothing,
+    and only the last level is fitted: the others have had their steps already."""
+    problem, functions, *others = plan.sampler.args  # pyright: ignore (a `Partial`)
+    finer_problem = dataclasses.replace(problem, levels=halved(problem.levels))
+    last_level = len(problem.levels.h) - 1
+    last_functions = _fits(finer_problem, key, functions.basis, [last_level])
+    known_functions = jtu.tree_map(lambda x: x[1:], functions)
+    finer_functions = _joined([known_functions, last_functions])
+    sampler = jtu.Partial(controlled_paths, finer_problem, finer_functions, *others)
+    return plan._replace(sampler=sampler, tails=None)
 
 
 class _ControlledSampling(NamedTuple):
@@ -312,40 +326,45 @@ def _reason(basis: AbstractBasis, choice: Choice) -> str:
     )
 
 
-def _fits(problem: Problem, key: PRNGKeyArray, basis: AbstractBasis) -> FittedFunctions:
-    """The fits of all levels."""
+def _fits(
+    problem: Problem, key: PRNGKeyArray, basis: AbstractBasis, levels: Sequence[int]
+) -> FittedFunctions:
+    """The fits of levels with these numbers."""
     # Newton's method is a quarter of the time to compile a fit, and few of its states need
     # it. A state at which the sweeps fail is left out of the fit.
     sweeps_only = dataclasses.replace(problem, solver=without_newton(problem.solver))
-    functions, num_failed = _fits_and_failures(sweeps_only, key, basis)
+    functions, num_failed = _fits_and_failures(sweeps_only, key, basis, levels)
     has_no_newton = eqx.tree_equal(sweeps_only.solver, problem.solver)
     if num_failed == 0 or has_no_newton:
         return functions
     # If paths of the pilot fail, steps are too long for sweeps: the fit is made again, with
     # Newton's method.
-    functions, _ = _fits_and_failures(problem, key, basis)
+    functions, _ = _fits_and_failures(problem, key, basis, levels)
     return functions
 
 
 def _fits_and_failures(
-    problem: Problem, key: PRNGKeyArray, basis: AbstractBasis
+    problem: Problem, key: PRNGKeyArray, basis: AbstractBasis, levels: Sequence[int]
 ) -> tuple[FittedFunctions, int]:
-    """The fits of all levels, and how many of the pilot's paths failed."""
+    """The fits of levels, and how many of the pilot's paths failed."""
     functions_of_levels = []
     failures_of_levels = []
-    for index in range(len(problem.levels.h)):
+    for index in levels:
         # An integer would be static: a program for each level. Its shape keeps the axis of
-        # levels, along which the fits are joined below.
+        # levels, along which the fits are joined.
         functions, num_failed = _fit_of_level(problem, np.array([index]), key, basis)
         functions_of_levels.append(functions)
         failures_of_levels.append(num_failed)
     # The numbers are traced if a function of the user closes over traced values.
     check_untraced("`expectation`", failures_of_levels)
-    num_failed = sum(map(int, failures_of_levels))
+    return _joined(functions_of_levels), sum(map(int, failures_of_levels))
+
+
+def _joined(functions_of_levels: Sequence[FittedFunctions]) -> FittedFunctions:
+    """The functions of several levels, each with a leading axis of levels, as one."""
     if len(functions_of_levels) == 1:
-        return functions_of_levels[0], num_failed
-    functions = jtu.tree_map(lambda *xs: jnp.concatenate(xs), *functions_of_levels)
-    return functions, num_failed
+        return functions_of_levels[0]
+    return jtu.tree_map(lambda *xs: jnp.concatenate(xs), *functions_of_levels)
 
 
 @ft.partial(compiled, quickly=True)
