@@ -15,6 +15,7 @@ from jaxtyping import Array, Key, PRNGKeyArray, PyTree
 
 from .._arguments import check_untraced
 from .._custom_types import Devices
+from .._programs import once_for_each_signature
 from .batch import batch_moments, BatchMoments, quick_batch_moments
 from .estimate import (
     check_same,
@@ -27,7 +28,7 @@ from .estimate import (
     share_of_needed,
 )
 from .progress import Progress
-from .sampling import MOST_SAMPLES, Samples, SamplingPlan
+from .sampling import Averaged, MOST_SAMPLES, Samples, SamplingPlan
 
 
 class Kept:
@@ -191,6 +192,12 @@ class _Batches:
     ) -> BatchMoments:
         """Starts a batch on all devices, from sample number `first` on. Samples from number
         `end` on do not count."""
+        return self._batch_moments(*self._arguments(first, end, sampler))
+
+    def _arguments(
+        self, first: int, end: int, sampler: Callable[..., Samples]
+    ) -> tuple[Any, ...]:
+        """The arguments of `batch_moments`."""
         num_devices = len(self._devices)
         low_high = np.array([first & 0xFFFFFFFF, first >> 32], np.uint32)
         num_wanted = max(0, min(self.size * num_devices, end - first))
@@ -198,7 +205,7 @@ class _Batches:
         if num_devices == 1:
             on_device = jax.device_put((low_high, num_wanted), self._devices[0])
             low_high, num_wanted = on_device
-        return self._batch_moments(
+        return (
             sampler,
             self.key_data,
             self._key_impl,
@@ -221,12 +228,9 @@ class _Batches:
         continues."""
         struct = self._struct
         if struct is None:
-            # JAX caches this trace and uses it for the first batch.
-            sampler = self.sampler_at(first)
-            of_batch = eqx.filter_eval_shape(self.start, first, end, sampler)
-            # Without the axis of devices.
-            struct = jtu.tree_map(
-                lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), of_batch.mean
+            struct = _struct_of_mean(
+                self._batch_moments,
+                *self._arguments(first, end, self.sampler_at(first)),
             )
         zeros = jtu.tree_map(lambda x: np.zeros(x.shape), struct)
         return Moments(
@@ -241,6 +245,19 @@ class _Batches:
             size=zeros,
             dtypes=jtu.tree_map(lambda x: str(x.dtype), struct.value),
         )
+
+
+@once_for_each_signature
+def _struct_of_mean(
+    batch_moments: Callable[..., BatchMoments], *arguments: Any
+) -> Averaged:
+    """The shapes and dtypes of the mean of a batch on one device."""
+    # JAX caches this trace and uses it for the first batch.
+    of_batch = eqx.filter_eval_shape(batch_moments, *arguments)
+    # Without the axis of devices.
+    return jtu.tree_map(
+        lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), of_batch.mean
+    )
 
 
 def _samples_of_paths(
