@@ -16,6 +16,7 @@ from jaxtyping import Array, PRNGKeyArray, PyTree, UInt32
 
 from .._compat import nondifferentiable
 from .._custom_types import RealScalarLike
+from .._programs import once_for_each_signature
 from .random import AbstractLaw, Gaussian, is_key, Place, place_of, random_words
 
 
@@ -244,6 +245,7 @@ def is_random(path: diffrax.AbstractBrownianPath) -> bool:
     return holds_a_key or isinstance(path, UnspecifiedPath)
 
 
+@once_for_each_signature
 def increment_struct(
     path: diffrax.AbstractBrownianPath,
 ) -> PyTree[jax.ShapeDtypeStruct]:
