@@ -59,9 +59,8 @@ _MOST_REMEMBERED = 128
 # have at most this many binary digits: those like 2, 1/2 and 12 belong to formulas, and XLA
 # simplifies what is made with them.
 _DIGITS_OF_FORMULAS = 2
-# Operations whose second argument XLA should know: it multiplies by the inverse of a
-# divisor, and makes products and roots of powers.
-_KNOWN_SECOND = frozenset(["div", "pow", "rem"])
+# Operations whose second argument XLA should know: it makes products and roots of powers.
+_KNOWN_SECOND = frozenset(["pow", "rem"])
 
 Result = TypeVar("Result")
 
@@ -163,6 +162,7 @@ def _converted(x: Any, aval: Any) -> Array | np.ndarray:
 
 def _numbers_apart(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:
     """The program with constants for numbers in its text, and these numbers."""
+    jaxpr = jaxpr.replace(eqns=[_with_inverse_of_divisor(eqn) for eqn in jaxpr.eqns])
     places = [
         (k, place)
         for k, eqn in enumerate(jaxpr.eqns)
@@ -174,11 +174,43 @@ def _numbers_apart(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:
     return with_constants_for(jaxpr, places), arrays
 
 
+def _with_inverse_of_divisor(eqn: JaxprEqn) -> JaxprEqn:
+    """The operation itself, or in place of a division by a number a product with its
+    inverse, to which XLA turns it, too. Thus the number can be data at no cost."""
+    if eqn.primitive.name != "div":
+        return eqn
+    dividend, divisor = eqn.invars
+    if not isinstance(divisor, Literal):
+        return eqn
+    value = np.asarray(divisor.val)
+    if not _has_many_digits(value):
+        return eqn
+    inverse = Literal(np.ones_like(value) / value, divisor.aval)
+    product = _product(divisor.aval.dtype)  # pyright: ignore (of an array)
+    return eqn.replace(
+        primitive=product.primitive,
+        params=product.params,
+        invars=[dividend, inverse],
+    )
+
+
+@ft.cache
+def _product(dtype: Any) -> JaxprEqn:
+    """A product, as this version of JAX writes it."""
+    struct = jax.ShapeDtypeStruct((), dtype)
+    [eqn] = jax.make_jaxpr(jax.lax.mul)(struct, struct).jaxpr.eqns
+    return eqn
+
+
 def _is_data(eqn: JaxprEqn, place: int, number: Literal) -> bool:
     """Whether a number in the text of a function is data, rather than part of a formula."""
     if place == 1 and eqn.primitive.name in _KNOWN_SECOND:
         return False
-    value = np.asarray(number.val)
+    return _has_many_digits(np.asarray(number.val))
+
+
+def _has_many_digits(value: np.ndarray) -> bool:
+    """Whether a number is more likely the value of a parameter than part of a formula."""
     if not np.issubdtype(value.dtype, np.floating) or not np.isfinite(value):
         return False
     mantissa, _ = np.frexp(value.astype(float))

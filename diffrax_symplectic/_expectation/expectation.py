@@ -55,7 +55,7 @@ from .strong_friction import unresolved_friction
 _FEWEST_LEVELS = 2
 _MOST_LEVELS = 6
 # Without fits, levels and checks of the steps there is one program.
-_QUICK_LOOK = "`sampling=IndependentPaths(1000)` and `levels=1`"
+_QUICK_LOOK = "few paths on one level, `sampling=IndependentPaths(1000), levels=1`"
 # Two means count as different if they are this many standard errors apart: by chance that
 # happens once in sixteen thousand times.
 _SURE_OF_LAW = 4
@@ -180,9 +180,9 @@ def expectation(
     solver, for [`diffrax_symplectic.StrangGauss`][], for the noise, for the friction or for
     another decay; if forces or noise jump in time within a step, or at its end where the
     solver takes them, or change too fast for the steps; if none of these is the case, but a
-    third level on at most 512 paths changes a mean of two levels by more than its error;
-    and if rounding in single precision may exceed the standard error, or numbers count as
-    zero.
+    trial with a third level changes a mean of two levels by more than its error, or steps
+    turn states far and the trial is too noisy to tell; and if rounding in single precision
+    may exceed the standard error, or numbers count as zero.
 
     **Source:** [Chan, Golub and LeVeque
     (1983)](https://doi.org/10.1080/00031305.1983.10483115) for combining means and
@@ -208,7 +208,7 @@ def expectation(
     # The looks and trials after the last sample may be interrupted, too.
     with ShortTraceback(), Kept() as kept, progress:
         while True:
-            progress.stage("compiling and fitting")
+            progress.stage("preparing the samples")
             problem, used_sampling, plan = choose(
                 ft.partial(problem_of, levels), request
             )

@@ -29,7 +29,7 @@ from .choose import trial_key
 from .estimate import combined_results, Expectation, label_of
 from .fitted import ValueFunctions, with_half_steps
 from .independent import IndependentPaths
-from .long_steps import may_miss_rotations
+from .long_steps import unresolved_angle
 from .run import run
 from .sampling import SamplingPlan
 
@@ -87,9 +87,8 @@ def trial_with_finer_level(
         return Trial()
     key = trial_key(key)
     is_fitted = isinstance(estimate.sampling, ValueFunctions)
-    if is_fitted and (
-        plan.is_fit_quick or may_miss_rotations(problem.with_any_steps())
-    ):
+    any_steps = problem.with_any_steps()
+    if is_fitted and (plan.is_fit_quick or unresolved_angle(any_steps) is not None):
         changes = _changes_by_same_sampling(estimate, plan, key, devices)
     else:
         changes = _changes_on_same_noise(estimate, problem, key, devices)
@@ -99,9 +98,12 @@ def trial_with_finer_level(
         h = float(problem.levels.h[-1]) / 2
         return Trial(message=_message(estimate, changes, h))
     # Noise next to value functions is always larger, which says little of resolved steps.
-    if changes.are_hidden and not is_fitted:
+    if is_fitted or not changes.are_hidden:
+        return Trial()
+    angle = unresolved_angle(any_steps)
+    if angle is None:
         return Trial(caveat=_caveat(changes))
-    return Trial()
+    return Trial(message=_message_on_chance(problem, changes, angle))
 
 
 class _Changes(NamedTuple):
@@ -146,16 +148,25 @@ def _message(estimate: Expectation, changes: _Changes, h: float) -> str:
         f"Steps are too long: on {changes.num_paths} paths of a trial, a third level, with "
         f"steps of {h:.3g}, changes a mean{label_of(estimate, worst)} by "
         f"{changes.sizes[worst]:.2g} ± {changes.noise[worst]:.1g}, which is more than its "
-        f"error, {changes.errors[worst]:.1g}. Pass a smaller `dt0`, or `tol`, which takes "
-        "smaller steps until they fit the order."
+        f"error, {changes.errors[worst]:.1g}. Pass a smaller `dt0`, or `levels=3`, which "
+        "checks the order."
+    )
+
+
+def _message_on_chance(problem: Problem, changes: _Changes, angle: float) -> str:
+    return (
+        f"Steps of `dt0={float(problem.levels.h[0]):g}` are long, omega h = {angle:.3g} "
+        "for the largest frequency of the drift where paths start, and two levels may "
+        f"agree on a wrong mean by chance: {_caveat(changes)}, which is more than the "
+        "error. Pass a smaller `dt0`, or `levels=3`, which checks the order."
     )
 
 
 def _caveat(changes: _Changes) -> str:
     worst = np.argmax(changes.visible / changes.errors)
     return (
-        f"a trial with half the steps, on {changes.num_paths:,} paths, would have shown a "
-        f"change of the mean above {changes.visible[worst]:.1e} (see `levels`)"
+        f"a trial with half the steps, on {changes.num_paths:,} paths, could only see a "
+        f"change of the mean above {changes.visible[worst]:.1e}"
     )
 
 

@@ -19,7 +19,8 @@ def _told(*given, **options):
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         got = ds.expectation(*given, key=jr.key(0), **options)
-    found = [str(x.message) for x in told if "a third level" in str(x.message)]
+    messages = [str(x.message) for x in told]
+    found = [x for x in messages if "a third level" in x or "by chance" in x]
     assert len(found) <= 1
     return got, found[0] if found else None
 
@@ -223,7 +224,22 @@ def test_changes_that_noise_would_hide_are_told_apart_from_those_that_are_sure()
     assert not hidden.are_sure and hidden.are_hidden
     assert not small.are_sure and not small.are_hidden
     # 3.2 standard errors, for the larger of two changes.
-    assert (
-        "on 512 paths, would have shown a change of the mean above 6.4e-02"
-        in _caveat(hidden)
+    assert "on 512 paths, could only see a change of the mean above 6.4e-02" in _caveat(
+        hidden
     )
+
+
+def test_means_that_cross_by_chance_are_told_where_the_trial_is_too_noisy():
+    washboard = lambda t, p, q, args: p**2 / 2 - jnp.cos(q) - 0.6 * q
+    terms = ds.langevin_terms(washboard, 0.5, 0.5, ())
+    y0 = jnp.array(0.0), jnp.array(0.0)
+    square = lambda t, y, args: y[0] ** 2
+    sampling = ds.IndependentPaths(2**17)
+    given = square, terms, ds.BAOAB(), 0
+    got, message = _told(*given, 42, 1.4, y0, sampling=sampling)
+    # By the Fokker-Planck equation on Fourier modes and Hermite functions.
+    assert abs(got.mean - 1.025888) > 4 * got.error
+    assert "may agree on a wrong mean by chance" in message
+    got, message = _told(*given, 42, 0.7, y0, sampling=ds.IndependentPaths(2**14))
+    assert abs(got.mean - 1.025888) < 3 * got.error
+    assert message is None
