@@ -4,7 +4,7 @@ import dataclasses
 import functools as ft
 import textwrap
 from collections.abc import Callable, Collection, Sequence
-from typing import Any, cast, get_args, NamedTuple
+from typing import cast, get_args, NamedTuple
 
 import diffrax
 import jax
@@ -24,13 +24,23 @@ from ._brownian import (
 from ._custom_types import Args, RealScalarLike, Terms, Y
 from ._solver import (
     AbstractSymplecticSolver,
+    AdditiveGauss,
     BAOAB,
     ImplicitMidpoint,
     is_solver,
-    LANGEVIN,
+    LangevinMiddle,
+    LevyAreaMidpoint,
+    NinomiyaVictoir,
+    PlateauGauss,
+    PlateauVerlet,
     Record,
-    SOLVERS,
+    SRKs2,
+    SRKs4,
+    SRKw1,
+    SRKw4,
+    SRKw5,
     StormerVerlet,
+    StrangGauss,
     Want,
 )
 from ._tableau import Structure
@@ -62,11 +72,34 @@ from ._terms import (
 )
 
 
-# The most stage vectors that a step of higher order may solve for. At the cost of a hundred
-# steps of the midpoint rule, `NinomiyaVictoir` had 0.1, 0.16, 0.14 and 1.2 times its error
-# for 2, 3, 4 and 6 noises of linear systems with two or three degrees of freedom. It solves
-# for 12 stage vectors with four noises.
-_MOST_STAGE_VECTORS = 12
+# The suggested solvers, best first: by order, then by the size of the equations of a step.
+# Those for friction are the first for means in a heat bath, of which most are functions of
+# positions, and exact.
+FOR_FRICTION = (BAOAB, LangevinMiddle)
+FOR_MEANS = (
+    AdditiveGauss,
+    StormerVerlet,
+    SRKw5,
+    SRKs4,
+    StrangGauss,
+    NinomiyaVictoir,
+    SRKw4,
+    SRKw1,
+)
+FOR_PATHS = (
+    PlateauVerlet,
+    SRKs4,
+    PlateauGauss,
+    StormerVerlet,
+    *FOR_FRICTION,
+    SRKs2,
+    LevyAreaMidpoint,
+    ImplicitMidpoint,
+)
+# At the cost of a hundred steps of the midpoint rule, `NinomiyaVictoir` had 0.1, 0.16, 0.14
+# and 1.2 times its error for 2, 3, 4 and 6 noises of linear systems with two or three
+# degrees of freedom.
+_MOST_FLOWS_OF_NOISE = 4
 # The solver for a heat bath whose Hamiltonian is any that is quadratic in the momenta.
 _BATH_OF_ANY_ENERGY = BAOAB(ImplicitMidpoint())
 
@@ -155,10 +188,10 @@ def suggest_solver(
     explicit and needs too many steps, take the next implicit one. Whether noises commute is
     tested at random states, which is no proof.
 
-    They are ranked by: with friction, exact stationary positions (for means); a cost of at
-    most twelve stage vectors; order; right energies for noise on stiff modes; fewest stage
-    vectors. If masses depend on positions, `BAOAB(ImplicitMidpoint())` comes first.
-    [Measured errors](advice.md) support this.
+    They are ranked by order, then by the size of the equations of a step. With friction,
+    those with exact stationary positions come first for means, and if masses depend on
+    positions `BAOAB(ImplicitMidpoint())`. `NinomiyaVictoir` comes last with more than four
+    noises. [Measured errors](advice.md) support this.
 
     **Arguments:**
 
@@ -431,43 +464,26 @@ def ranked(
     structures = {"any", *structures}
     if {"separable", "constant"} <= structures:
         structures.add("separable and constant")
-
-    def rank(solver: AbstractSymplecticSolver) -> tuple[Any, ...]:
-        """What to sort by: the best solver has the smallest tuple."""
-        record = _record(solver)
-        order = record.order(want, commute)
-        assert order is not None
-        # In a heat bath most means are stationary means of functions of positions. With
-        # friction in the drift, too, other solvers have them up to some friction only.
-        wants_stationary = (friction or friction_in_drift) and want == "weak"
-        is_inexact = wants_stationary and "qq" not in record.stationary
-        # The sizes of the systems of equations of a step.
-        stage_vectors = solver.stage_vectors(num_noises)
-        # In a separable system only half of the state is solved for.
-        cost = sum(stage_vectors) / (2 if solver.structure == "separable" else 1)
-        is_costly = cost > _MOST_STAGE_VECTORS
-        is_wrong_on_stiff_modes = record.right_energy_unresolved is False
-        largest_system = max(stage_vectors, default=0)
-        return (
-            is_inexact,
-            is_costly,
-            -order,
-            is_wrong_on_stiff_modes,
-            cost,
-            largest_system,
-        )
-
     noises = ("any", "commuting" if commute else "not commuting")
 
-    def is_suggested(solver: AbstractSymplecticSolver) -> bool:
-        record = _record(solver)
-        return want in record.suggested and record.noises in noises
+    def is_suitable(kind: type[AbstractSymplecticSolver]) -> bool:
+        if kind in FOR_FRICTION:
+            return friction
+        solver = kind()
+        return solver.structure in structures and _record(solver).noises in noises
 
-    all_solvers = [solver_class() for solver_class in SOLVERS]
-    solvers = [solver for solver in all_solvers if solver.structure in structures]
-    if friction:
-        solvers += [solver_class() for solver_class in LANGEVIN]
-    best_first = sorted(filter(is_suggested, solvers), key=rank)
+    kinds = list(filter(is_suitable, FOR_MEANS if want == "weak" else FOR_PATHS))
+    if want == "weak":
+        if NinomiyaVictoir in kinds and num_noises > _MOST_FLOWS_OF_NOISE:
+            kinds.remove(NinomiyaVictoir)
+            kinds.append(NinomiyaVictoir)
+        if friction or friction_in_drift:
+            # It has exact stationary means of harmonic modes at every step.
+            kinds.remove(SRKw1)
+            kinds.insert(0, SRKw1)
+        if friction:
+            kinds = [*FOR_FRICTION, *kinds]
+    best_first: list[AbstractSymplecticSolver] = [kind() for kind in kinds]
     return [_BATH_OF_ANY_ENERGY, *best_first] if general_bath else best_first
 
 

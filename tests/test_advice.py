@@ -12,6 +12,7 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import drives
 from diffrax_symplectic._solver import LANGEVIN, SOLVERS
+from diffrax_symplectic._suggest import FOR_FRICTION, FOR_MEANS, FOR_PATHS
 from examples import advice
 from examples.stability import friction
 
@@ -19,7 +20,11 @@ from examples.stability import friction
 # Steps of explicit solvers, and others for implicit ones.
 RESOLVED, STIFF = jnp.array([0.5, 1.8]), jnp.array([1.0, 3.0, 5.0])
 EXPLICIT = [kind for kind in (*SOLVERS, *LANGEVIN) if kind().stage_vectors(1) == ()]
-SUGGESTED = [kind for kind in (*SOLVERS, *LANGEVIN) if kind().record.suggested]
+SUGGESTED = [
+    kind
+    for kind in (*SOLVERS, *LANGEVIN)
+    if kind in FOR_FRICTION + FOR_MEANS + FOR_PATHS
+]
 # The Lévy areas of `LevyAreaMidpoint` have no finite set of outcomes; without noise
 # brackets it is the midpoint rule.
 MEASURED = [

@@ -11,8 +11,14 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import increment_struct, UnspecifiedPath
-from diffrax_symplectic._solver import LANGEVIN, own_path, SOLVERS
-from diffrax_symplectic._suggest import _shape_code, ranked
+from diffrax_symplectic._solver import LANGEVIN, own_path
+from diffrax_symplectic._suggest import (
+    _shape_code,
+    FOR_FRICTION,
+    FOR_MEANS,
+    FOR_PATHS,
+    ranked,
+)
 from diffrax_symplectic._terms import (
     brownian_paths,
     motion_numbers,
@@ -136,7 +142,7 @@ def check_systems(seeds) -> set:
 def test_no_suggestion_is_refused():
     # Noise of each kind, with p and q mixed by H0 and not, in both precisions.
     suggested = check_systems([0, 2, 3, 5, 6, 9, 12, 18])
-    assert suggested == {kind for kind in SOLVERS if kind().record.suggested}
+    assert suggested == {*FOR_MEANS, *FOR_PATHS} - {*FOR_FRICTION}
 
 
 @pytest.mark.parametrize("want", ["weak", "strong"])
@@ -150,7 +156,7 @@ def test_with_friction_solvers_that_have_it_are_suggested(want):
     of_order = ds.SRKs4() if want == "strong" else ds.BAOAB()
     other_general = ds.PlateauGauss() if want == "strong" else ds.BAOAB()
     any_energy = ds.BAOAB(ds.ImplicitMidpoint())
-    splittings = [kind() for kind in LANGEVIN if want in kind().record.suggested]
+    splittings = [kind() for kind in FOR_FRICTION]
     for terms, first, apart in (
         # Stationary positions come first for means, and the order for paths.
         (bath(H0), of_order, splittings),

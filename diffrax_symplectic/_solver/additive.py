@@ -77,7 +77,6 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=3 / 2,
         choose="Accurate paths; the noise may depend on time. Two stage vectors, one after "
         "the other.",
-        suggested=("weak", "strong"),
         right_energy_unresolved=True,
         most_friction=1.0,
     )
@@ -131,7 +130,6 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=2,
         strong=None,
         choose="As cheap as the midpoint rule, for low accuracy.",
-        suggested=("weak",),
         right_energy_unresolved=True,
         most_friction=0.5,
     )
@@ -183,7 +181,6 @@ class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         "long steps, omega h > 1, for stationary laws of linear systems (the midpoint rule "
         "has them exactly), or for `ValueFunctions` in strongly nonlinear systems (36 "
         "outcomes per step).",
-        suggested=("weak",),
         right_energy_unresolved=True,
         most_friction=2.0,
     )

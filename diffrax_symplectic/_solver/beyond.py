@@ -64,7 +64,6 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=None,
         choose="For accurate expectations: four stage vectors in three small systems.",
         noises="commuting",
-        suggested=("weak",),
         right_energy_unresolved=True,
         most_friction=0.5,
         # With two levels, the share of means that were off by more than two error bars, for
@@ -146,7 +145,6 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         strong=None,
         choose="For few noises: two stage vectors per noise, and four for the drift.",
         noises="not commuting",
-        suggested=("weak",),
         right_energy_unresolved=True,
         most_friction=0.5,
     )
@@ -277,7 +275,6 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=1,
         choose="The midpoint rule with Lévy areas, for noises that do not commute.",
         noises="not commuting",
-        suggested=("strong",),
         stationary=("qq", "pq", "pp"),
         right_energy_unresolved=False,
     )
@@ -329,7 +326,6 @@ class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         strong=(3 / 2, 1 / 2),
         choose="For accurate paths: two stage vectors, and brackets of vector fields.",
         noises="commuting",
-        suggested=("strong",),
         stationary=("qq", "pq", "pp"),
         right_energy_unresolved=False,
     )

@@ -32,7 +32,6 @@ class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=1,
         strong=(1, 1 / 2),
         choose="A good first choice: one stage vector for any number of noises.",
-        suggested=("strong",),
         stationary=("qq", "pq", "pp"),
         right_energy_unresolved=False,
     )
@@ -99,7 +98,6 @@ class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=1,
         strong=None,
         choose="The midpoint rule for expectations. Cheap, for low accuracy.",
-        suggested=("weak",),
         stationary=("qq", "pq", "pp"),
         right_energy_unresolved=False,
     )

@@ -183,7 +183,6 @@ _FREE_FLIGHT = Record(
     "and q together, such as a heat current, too. Not for functions of p alone in "
     "equilibrium, such as a kinetic temperature, for transients to more than three digits, "
     "or for frequencies omega > 2 / h.",
-    suggested=("weak", "strong"),
     stationary=("qq", "pq"),
 )
 _CHOOSE_A_FLOW = (
@@ -370,6 +369,5 @@ class LangevinMiddle(AbstractLangevinSplitting):
         choose="Langevin dynamics in equilibrium, for functions of p alone. Its momenta "
         "lag by half a step and are wrong where a force drives a current: not for "
         "functions of p and q together, such as a heat current.",
-        suggested=("weak", "strong"),
         stationary=("qq", "pp"),
     )

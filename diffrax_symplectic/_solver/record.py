@@ -17,7 +17,6 @@ class Record(NamedTuple):
     - `strong`: its strong order, or `None` for a weak method.
     - `choose`: when to choose it, in a sentence.
     - `noises`: the noises for which it is recommended. It accepts any.
-    - `suggested`: the kinds of convergence for which `suggest_solver` returns it.
     - `stationary`: the second moments, of `"qq"`, `"pq"` and `"pp"`, of a harmonic mode in
         a heat bath whose stationary values are exact for every stable step.
     - `right_energy_unresolved`: whether noise gives a harmonic mode without friction the
@@ -25,21 +24,20 @@ class Record(NamedTuple):
     - `most_friction`: the greatest friction, as a rate times the step, up to which the
         stationary energies of a resolved harmonic mode in a heat bath are within a tenth,
         of those in `examples/stability/friction.py`; `None` if there is no limit. Given
-        for suggested solvers.
+        for the solvers that `suggest_solver` returns.
     - `most_frequency`: the largest frequency of the drift, as omega h, up to which two
         levels were measured to hold their error bars; `None` if nothing is promised.
 
-    The last four are measured, in `tests/test_advice.py`, for the solvers that are
-    `suggested`. Leave them out for others: the page then promises and warns of nothing.
-    The random variables of `LevyAreaMidpoint` have no finite set of outcomes, so it states
-    those of the midpoint rule, which a test compares its steps with.
+    The last four are measured, in `tests/test_advice.py`, for the solvers that
+    `suggest_solver` returns. Leave them out for others: the page then promises and warns of
+    nothing. The random variables of `LevyAreaMidpoint` have no finite set of outcomes, so
+    it states those of the midpoint rule, which a test compares its steps with.
     """
 
     weak: Order
     strong: Order | None
     choose: str
     noises: Noises = "any"
-    suggested: tuple[Want, ...] = ()
     stationary: tuple[str, ...] = ()
     right_energy_unresolved: bool | None = None
     most_friction: float | None = None

@@ -111,7 +111,6 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=2,
         strong=None,
         choose="Solves for half of the state. For stiff systems.",
-        suggested=("weak",),
         right_energy_unresolved=False,
     )
     a21: float = free_parameter("a21", 0.5)
@@ -146,7 +145,6 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         weak=1,
         strong=1,
         choose="The midpoint rule on half of the state. For stiff systems.",
-        suggested=("strong",),
         right_energy_unresolved=False,
     )
     tableau: ClassVar[SeparableTableau] = SeparableTableau(
@@ -224,7 +222,6 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
         weak=2,
         strong=1,
         choose="Explicit, with the cheapest step. Not for frequencies omega > 2 / h.",
-        suggested=("weak", "strong"),
     )
     tableau: ClassVar[PartitionedTableau] = PartitionedTableau(
         alpha=[1],
@@ -303,6 +300,5 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
         weak=2,
         strong=3 / 2,
         choose="Explicit, with accurate paths. Not for frequencies omega > 4 / h.",
-        suggested=("strong",),
     )
     tableau: ClassVar[PartitionedTableau] = _plateau_verlet

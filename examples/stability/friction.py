@@ -7,6 +7,7 @@ import numpy as np
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._solver import LANGEVIN, SOLVERS
+from diffrax_symplectic._suggest import FOR_MEANS, FOR_PATHS
 
 from ..advice import stationary, with_newton
 from ._page import fill, Page, table
@@ -25,7 +26,7 @@ def _is_suggested_for_drift_with_friction(solver) -> bool:
     # Without brackets of noises `LevyAreaMidpoint` is `ImplicitMidpoint`.
     if solver.structure.startswith("separable") or "A" in solver.variables:
         return False
-    return bool(solver.record.suggested)
+    return type(solver) in (*FOR_MEANS, *FOR_PATHS)
 
 
 # All that `suggest_solver` names for Langevin terms.
