@@ -190,17 +190,20 @@ def is_rule(x: Any) -> bool:
 
 def with_constants_for(jaxpr: Jaxpr, places: Sequence[tuple[int, int]]) -> Jaxpr:
     """A program with new constants, after those that it has, in these places: each is the
-    number of an operation and that of its argument."""
-    avals: list[Any] = [jaxpr.eqns[k].invars[place].aval for k, place in places]
+    number of an operation and that of its argument, or the number of operations and that
+    of a result."""
+    operands: list[list[Any]] = [list(eqn.invars) for eqn in jaxpr.eqns]
+    operands.append(list(jaxpr.outvars))
+    avals = [operands[k][place].aval for k, place in places]
     structs = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
     # Versions of JAX construct variables from different arguments: here it does so itself.
     new_constants = jax.make_jaxpr(lambda *xs: xs)(*structs).jaxpr.invars
-    eqns = list(jaxpr.eqns)
     for (k, place), constant in zip(places, new_constants):
-        invars = list(eqns[k].invars)
-        invars[place] = constant
-        eqns[k] = eqns[k].replace(invars=invars)
-    return jaxpr.replace(eqns=eqns, constvars=[*jaxpr.constvars, *new_constants])
+        operands[k][place] = constant
+    *of_operations, results = operands
+    eqns = [eqn.replace(invars=xs) for eqn, xs in zip(jaxpr.eqns, of_operations)]
+    constants = [*jaxpr.constvars, *new_constants]
+    return jaxpr.replace(eqns=eqns, outvars=results, constvars=constants)
 
 
 # Not to be made while other threads use JAX.

@@ -170,6 +170,15 @@ def _numbers_apart(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:
         if isinstance(x, Literal) and _is_data(eqn, place, x)
     ]
     numbers = [jaxpr.eqns[k].invars[place] for k, place in places]
+    # A result that is a number, such as a constant friction. As data it is no weak number:
+    # the results of other dtypes would change.
+    dtypes = {_dtype_of(x.aval) for x in jaxpr.invars}
+    for place, x in enumerate(jaxpr.outvars):
+        if not isinstance(x, Literal) or dtypes != {_dtype_of(x.aval)}:
+            continue
+        if _has_many_digits(x):
+            places.append((len(jaxpr.eqns), place))
+            numbers.append(x)
     arrays = [jnp.asarray(x.val, x.aval.dtype) for x in numbers]  # pyright: ignore
     return with_constants_for(jaxpr, places), arrays
 
@@ -182,9 +191,9 @@ def _with_inverse_of_divisor(eqn: JaxprEqn) -> JaxprEqn:
     dividend, divisor = eqn.invars
     if not isinstance(divisor, Literal):
         return eqn
-    value = np.asarray(divisor.val)
-    if not _has_many_digits(value):
+    if not _has_many_digits(divisor):
         return eqn
+    value = np.asarray(divisor.val)
     inverse = Literal(np.ones_like(value) / value, divisor.aval)
     product = _product(divisor.aval.dtype)  # pyright: ignore (of an array)
     return eqn.replace(
@@ -206,11 +215,12 @@ def _is_data(eqn: JaxprEqn, place: int, number: Literal) -> bool:
     """Whether a number in the text of a function is data, rather than part of a formula."""
     if place == 1 and eqn.primitive.name in _KNOWN_SECOND:
         return False
-    return _has_many_digits(np.asarray(number.val))
+    return _has_many_digits(number)
 
 
-def _has_many_digits(value: np.ndarray) -> bool:
+def _has_many_digits(number: Literal) -> bool:
     """Whether a number is more likely the value of a parameter than part of a formula."""
+    value = np.asarray(number.val)
     if not np.issubdtype(value.dtype, np.floating) or not np.isfinite(value):
         return False
     mantissa, _ = np.frexp(value.astype(float))
@@ -268,8 +278,14 @@ def _described(jaxpr: Jaxpr, rules: list[Any]) -> Hashable:
     return tuple(inputs), tuple(operations), outputs
 
 
-def _type_of(aval: Any) -> Hashable:
+def _type_of(aval: Any) -> tuple[tuple[int, ...], str, bool]:
+    """The shape, the dtype, and whether other dtypes prevail."""
     return aval.shape, str(aval.dtype), getattr(aval, "weak_type", False)
+
+
+def _dtype_of(aval: Any) -> str:
+    _, dtype, _ = _type_of(aval)
+    return dtype
 
 
 def _described_value(x: Any, rules: list[Any]) -> Hashable:

@@ -81,8 +81,9 @@ def test_a_bound_method_reads_the_attribute_as_it_is_now():
         (jtu.Partial(jnp.multiply, ONE), jtu.Partial(jnp.multiply, 2 * ONE)),
         (lambda x: jnp.where(x > 0.7, x, 0), lambda x: jnp.where(x > 0.3, x, 0)),
         (lambda x: x / 0.7, lambda x: x / 1.3),
+        (lambda x: 0.7, lambda x: 1.3),
     ],
-    ids="array numpy python module method partial comparison divisor".split(),
+    ids="array numpy python module method partial comparison divisor result".split(),
 )
 def test_other_numbers_are_another_input_of_the_same_program(first, second):
     one = traced(first, ONE)

@@ -42,7 +42,12 @@ from .finer_level import trial_with_finer_level
 from .fused_paths import FusedPaths
 from .jumps import jumps_at_step_ends, jumps_within_steps
 from .kinks import has_kinks
-from .long_steps import may_be_too_long, too_long_steps, unresolved_noise
+from .long_steps import (
+    may_be_too_long,
+    too_long_steps,
+    unresolved_angle,
+    unresolved_noise,
+)
 from .out_of_range import out_of_range
 from .progress import NO_METER, Progress
 from .run import Kept, run
@@ -233,9 +238,11 @@ def expectation(
         elif lost_numbers is not None:
             warnings.warn(lost_numbers, stacklevel=2)
         elif most_fail and may_be_too_long(problem.with_any_steps()):
+            angle = unresolved_angle(problem.with_any_steps())
+            shorter = float(dt0) / max(4, angle or 0)
             advice = (
                 f"Most likely, steps of `dt0={float(dt0):g}` are too long for "
-                f"`{type(solver).__name__}`: pass `dt0={float(dt0) / 4:g}` or less, or an "
+                f"`{type(solver).__name__}`: pass `dt0={shorter:.2g}` or less, or an "
                 f"implicit solver. {advice}"
             )
         for message in cautions(estimate, tol, advice):

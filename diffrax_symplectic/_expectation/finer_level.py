@@ -102,8 +102,8 @@ def trial_with_finer_level(
         return Trial()
     angle = unresolved_angle(any_steps)
     if angle is None:
-        return Trial(caveat=_caveat(changes))
-    return Trial(message=_message_on_chance(problem, changes, angle))
+        return Trial(caveat=_caveat(estimate, changes))
+    return Trial(message=_message_on_chance(estimate, problem, changes, angle))
 
 
 class _Changes(NamedTuple):
@@ -153,20 +153,23 @@ def _message(estimate: Expectation, changes: _Changes, h: float) -> str:
     )
 
 
-def _message_on_chance(problem: Problem, changes: _Changes, angle: float) -> str:
+def _message_on_chance(
+    estimate: Expectation, problem: Problem, changes: _Changes, angle: float
+) -> str:
+    caveat = _caveat(estimate, changes)
     return (
         f"Steps of `dt0={float(problem.levels.h[0]):g}` are long, omega h = {angle:.3g} "
         "for the largest frequency of the drift where paths start, and two levels may "
-        f"agree on a wrong mean by chance: {_caveat(changes)}, which is more than the "
-        "error. Pass a smaller `dt0`, or `levels=3`, which checks the order."
+        f"agree on a wrong mean by chance: {caveat}, which is more than the error. Pass a "
+        "smaller `dt0`, or `levels=3`, which checks the order."
     )
 
 
-def _caveat(changes: _Changes) -> str:
-    worst = np.argmax(changes.visible / changes.errors)
+def _caveat(estimate: Expectation, changes: _Changes) -> str:
+    worst = int(np.argmax(changes.visible / changes.errors))
     return (
         f"a trial with half the steps, on {changes.num_paths:,} paths, could only see a "
-        f"change of the mean above {changes.visible[worst]:.1e}"
+        f"change of the mean{label_of(estimate, worst)} above {changes.visible[worst]:.1e}"
     )
 
 
