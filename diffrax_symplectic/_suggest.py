@@ -72,9 +72,9 @@ from ._terms import (
 )
 
 
-# The suggested solvers, best first: by order, then by the size of the equations of a step.
-# Those for friction are the first for means in a heat bath, of which most are functions of
-# positions, and exact.
+# The suggested solvers, best first: by order; then those that give stiff modes the right
+# energy; then by the size of the equations of a step. Those for friction are the first for
+# means in a heat bath, of which most are functions of positions, and exact.
 FOR_FRICTION = (BAOAB, LangevinMiddle)
 FOR_MEANS = (
     AdditiveGauss,
@@ -188,10 +188,11 @@ def suggest_solver(
     explicit and needs too many steps, take the next implicit one. Whether noises commute is
     tested at random states, which is no proof.
 
-    They are ranked by order, then by the size of the equations of a step. With friction,
-    those with exact stationary positions come first for means, and if masses depend on
-    positions `BAOAB(ImplicitMidpoint())`. `NinomiyaVictoir` comes last with more than four
-    noises. [Measured errors](advice.md) support this.
+    They are ranked by order; then those that give stiff modes the right energy come first;
+    then by the size of the equations of a step. With friction, those with exact stationary
+    positions come first for means, and if masses depend on positions
+    `BAOAB(ImplicitMidpoint())`. `NinomiyaVictoir` comes last with more than four noises.
+    [Measured errors](advice.md) support this.
 
     **Arguments:**
 

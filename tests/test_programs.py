@@ -9,6 +9,7 @@ import sys
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 import pytest
@@ -93,6 +94,13 @@ def test_other_numbers_are_another_input_of_the_same_program(first, second):
         # As in a program: there XLA divides by multiplying with the inverse.
         assert program(0.5) == eqx.filter_jit(fn)(jnp.array(0.5))
     assert digest(one) != digest(other)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_a_divisor_as_data_gives_the_results_of_a_constant_bit_by_bit(dtype):
+    xs = jr.normal(jr.key(0), 1000, dtype)
+    divide = lambda x: x / 0.7
+    np.testing.assert_array_equal(traced(divide, xs)(xs), jax.jit(divide)(xs))
 
 
 def with_rule(factor):

@@ -144,15 +144,13 @@ def _instability(problem: Problem, dt0: float) -> str | None:
 
 def _unresolved_frequency(problem: Problem, dt0: float, most: float) -> str | None:
     """`too_long_steps` for an implicit solver with this `Record.most_frequency`."""
-    numbers = _numbers_of_steps(problem)
-    angles = np.asarray(_quick_frequencies(problem, numbers)) * dt0
-    largest = np.argmax(angles)
-    if not angles[largest] > most:
+    angle, number = _largest_angle(problem)
+    if not angle > most:
         return None
-    place = _place(problem, numbers[largest])
+    place = _place(problem, number)
     return (
         f"Steps of `dt0={dt0:g}` are too long for `{type(problem.solver).__name__}` "
-        f"{place}: omega h = {angles[largest]:.3g} for the largest frequency of the drift, "
+        f"{place}: omega h = {angle:.3g} for the largest frequency of the drift, "
         f"and with omega h > {most:g} two levels may agree on a wrong mean. Pass a smaller "
         "`dt0`, or `levels=3`, which checks the order."
     )
@@ -161,14 +159,12 @@ def _unresolved_frequency(problem: Problem, dt0: float, most: float) -> str | No
 def _lost_decay(problem: Problem, dt0: float) -> str | None:
     """`too_long_steps` for an implicit solver and modes that decay slowly and turn far in a
     step: it keeps them, on every level."""
-    numbers = _numbers_of_steps(problem)
-    angles = np.asarray(_quick_frequencies(problem, numbers)) * dt0
-    if not np.max(angles) > _TURNS_TOO_FAR_TO_DECAY:
+    largest_angle, number = _largest_angle(problem)
+    if not largest_angle > _TURNS_TOO_FAR_TO_DECAY:
         return None
     num_modes = sum(np.size(leaf) for leaf in jtu.tree_leaves(problem.y0))
     if num_modes > _MOST_MODES:
         return None
-    number = numbers[np.argmax(angles)]
     rates = np.linalg.eigvals(np.asarray(_quick_modes(problem, number), float))
     duration = float(problem.level(0).num_steps) * dt0
     # Rounding, and modes of a Hamiltonian that grow and decay in pairs, are no decay.
@@ -192,9 +188,18 @@ def unresolved_angle(problem: Problem) -> float | None:
     `None` if steps resolve it, and two levels differ by more than what they miss."""
     if constraint_of(problem.terms) is not None:
         return None
-    frequencies = np.asarray(_quick_frequencies(problem, _numbers_of_steps(problem)))
-    angle = float(np.max(frequencies)) * float(problem.level(0).h)
+    angle, _ = _largest_angle(problem)
     return angle if angle > _RESOLVED else None
+
+
+def _largest_angle(problem: Problem) -> tuple[float, float]:
+    """The largest angle by which a step on the first level turns the state in which paths
+    start, by the drift without friction, in radians; and the number of this step."""
+    numbers = _numbers_of_steps(problem)
+    frequencies = np.asarray(_quick_frequencies(problem, numbers))
+    largest = np.argmax(frequencies)
+    angle = float(frequencies[largest]) * float(problem.level(0).h)
+    return angle, numbers[largest]
 
 
 def unresolved_noise(problem: Problem, dt0: float) -> str | None:

@@ -105,7 +105,7 @@ def test_parts_that_do_not_fit_are_refused(tmp_path):
         one.merge(_part("ValueFunctions", 32, 32))
     with pytest.raises(ValueError, match="`merge` takes estimates; got 3"):
         one.merge(3)  # pyright: ignore
-    with pytest.raises(ValueError, match="`first` must be an integer, from 0 to"):
+    with pytest.raises(ValueError, match="`first` must be an integer from 0 to"):
         _part(name, 32, -1)
     with pytest.raises(ValueError, match="Pass either `start`.*, or `first`"):
         _part(name, 64, 32, start=one)

@@ -71,7 +71,9 @@ def _cautions_on_failures(estimate: Expectation, advice: str) -> Iterator[str]:
                 f"; the first two steps do not agree, since {num_with_dt0:,} paths fail "
                 f"with steps of `dt0` and {num_with_half:,} with half of it"
             )
-            advice = f"Pass a smaller `dt0`. {advice}"
+            # Where most paths fail, the advice says so.
+            if estimate.num_failed <= estimate.num_paths:
+                advice = f"Pass a smaller `dt0`. {advice}"
     yield f"{estimate.num_failed:,} paths failed: {consequence}. {advice}"
 
 
