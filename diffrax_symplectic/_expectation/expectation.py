@@ -256,9 +256,7 @@ def expectation(
         # Warnings of the problem come with its first samples, and not again with later
         # parts.
         if start is None and first == 0:
-            messages = _messages_on_steps(
-                estimate, problem.with_any_steps(), float(dt0)
-            )
+            messages = messages_on_steps(problem.with_any_steps(), float(dt0))
             # A trial takes longer than these looks, which name the cause.
             if estimate.levels == 2 and not messages:
                 trial = trial_with_finer_level(estimate, problem, plan, key, devices)
@@ -272,19 +270,18 @@ def expectation(
     return estimate
 
 
-def _messages_on_steps(
-    estimate: Expectation, problem: Problem, dt0: float
-) -> list[str]:
+def messages_on_steps(problem: Problem, dt0: float) -> list[str]:
     """What is wrong with the steps, which the error of the estimate may not show."""
+    levels = len(problem.levels.h)
     # With one level the result does not claim to include the discretization error.
-    if estimate.levels == 1:
+    if levels == 1:
         return []
     told = [
         jumps_within_steps(problem) or unresolved_drive(problem),
         too_long_steps(problem, dt0),
     ]
     # With three levels the order is checked, which shows the following.
-    if estimate.levels == 2:
+    if levels == 2:
         told += [
             unresolved_noise(problem, dt0),
             unresolved_friction(problem, dt0),

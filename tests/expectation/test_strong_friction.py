@@ -11,6 +11,8 @@ import pytest
 
 import diffrax_symplectic as ds
 
+from .messages import messages
+
 
 FEW = ds.IndependentPaths(64)
 MASSES = jnp.array([2.0, 0.5, 4.0])
@@ -21,14 +23,23 @@ def _well(t, p, q, args):
     return jnp.sum(p**2 / MASSES) / 2 + q @ STIFFNESS @ q / 2
 
 
-def _told(terms, solver, h, y0, phi=lambda t, y, args: jnp.sum(y[1] ** 2), **options):
+def _square_of_q(t, y, args):
+    return jnp.sum(y[1] ** 2)
+
+
+def _is_told(terms, solver, h, y0, args=None, levels=2):
+    """Whether a warning tells of the friction."""
+    told = messages(_square_of_q, terms, solver, 0, 8 * h, h, y0, args, levels)
+    return any("do not resolve" in message for message in told)
+
+
+def _estimate(terms, solver, h, y0, phi, num_paths=64):
     """The estimate, and whether a warning tells of the friction."""
-    options = dict(sampling=FEW) | options
+    given = phi, terms, solver, 0, 8 * h, h, y0
+    sampling = ds.IndependentPaths(num_paths)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
-        got = ds.expectation(
-            phi, terms, solver, 0, 8 * h, h, y0, key=jr.key(0), **options
-        )
+        got = ds.expectation(*given, key=jr.key(0), sampling=sampling)
     return got, any("do not resolve" in str(x.message) for x in told)
 
 
@@ -45,7 +56,7 @@ def test_solvers_with_friction_in_the_drift_are_told_beyond_their_limit(scale):
     for solver, most in ((ds.AdditiveGauss(), 2.0), (ds.SRKw5(), 0.5)):
         for factor in (0.9, 1.1):
             h = factor * most * 0.5 / 0.8 * scale
-            assert _told(terms, solver, h, REST)[1] == (factor > 1)
+            assert _is_told(terms, solver, h, REST) == (factor > 1)
 
 
 def test_a_bead_is_too_hot_on_both_levels_and_told():
@@ -53,8 +64,7 @@ def test_a_bead_is_too_hot_on_both_levels_and_told():
     terms = ds.langevin_terms(H0, 1000.0, 1.0, ())
     y0 = jnp.array(0.0), jnp.array(0.0)
     phi = lambda t, y, args: y[1] ** 2
-    sampling = ds.IndependentPaths(1000)
-    got, told = _told(terms, ds.AdditiveGauss(), 2.0, y0, phi, sampling=sampling)
+    got, told = _estimate(terms, ds.AdditiveGauss(), 2.0, y0, phi, 1000)
     # The exact mean is at most 0.01, in equilibrium.
     assert got.mean - 2 * got.error > 0.02
     assert told
@@ -67,12 +77,12 @@ def test_a_flow_that_keeps_overdamped_positions_where_they_are_is_told():
     terms = ds.langevin_terms(H0, G, 1.0, ())
     y0 = jnp.array(0.0), jnp.array(1.0)
     solver = ds.BAOAB(ds.ImplicitMidpoint())
-    got, told = _told(terms, solver, 0.5, y0, lambda t, y, args: y[1] ** 2)
+    got, told = _estimate(terms, solver, 0.5, y0, _square_of_q)
     assert got.mean - 10 * got.error > 0.1
     assert told
     # Plain midpoint steps relax, and steps that resolve the vibration do.
-    assert not _told(terms, ds.ImplicitMidpoint(), 0.5, y0)[1]
-    assert not _told(terms, solver, 0.015, y0)[1]
+    assert not _is_told(terms, ds.ImplicitMidpoint(), 0.5, y0)
+    assert not _is_told(terms, solver, 0.015, y0)
 
 
 @pytest.mark.parametrize(
@@ -80,14 +90,14 @@ def test_a_flow_that_keeps_overdamped_positions_where_they_are_is_told():
 )
 def test_solvers_for_every_friction_are_not_told(solver):
     terms = ds.langevin_terms(_well, 100.0, 1.0, (3,))
-    assert not _told(terms, solver, 0.2, REST)[1]
+    assert not _is_told(terms, solver, 0.2, REST)
 
 
 def test_stiff_modes_with_weak_friction_keep_their_law_and_are_not_told():
     H0 = lambda t, p, q, args: p**2 / 2 + 1e4 * q**2 / 2
     terms = ds.langevin_terms(H0, 1.0, 1.0, ())
     y0 = jnp.array(0.0), jnp.array(0.0)
-    assert not _told(terms, ds.BAOAB(ds.ImplicitMidpoint()), 0.5, y0)[1]
+    assert not _is_told(terms, ds.BAOAB(ds.ImplicitMidpoint()), 0.5, y0)
 
 
 def test_friction_that_depends_on_positions_masses_and_args_is_that_of_the_start():
@@ -98,9 +108,8 @@ def test_friction_that_depends_on_positions_masses_and_args_is_that_of_the_start
     for start in y0.values():
         start = jax.tree.map(jnp.array, start)
         for rate in (4.0, 6.0):  # h = 0.1 and the limit 0.5
-            got, told = _told(terms, ds.StrangGauss(), 0.1, start, args=jnp.array(rate))
+            told = _is_told(terms, ds.StrangGauss(), 0.1, start, jnp.array(rate))
             assert told == (rate > 5)
-            assert np.isfinite(got.mean)
 
 
 def _turning(t, q, args):
@@ -124,7 +133,7 @@ def test_friction_that_turns_far_in_a_step_is_told(solver):
 
     def told(strong, turns, h=1.0):
         args = jnp.array(strong), jnp.array(turns)
-        return _told(terms, solver, h, PLANE, args=args)[1]
+        return _is_told(terms, solver, h, PLANE, args)
 
     assert told(5.0, 2.0)
     assert not told(5.0, 0.1)
@@ -143,18 +152,18 @@ def test_friction_that_turns_is_told_in_any_unit_of_time_and_from_rest(scale):
     terms = ds.langevin_terms(energy, _turning, 1.0, (2,))
     for turns in (0.1, 2.0):
         args = jnp.array(5.0 * scale), jnp.array(turns)
-        assert _told(terms, ds.BAOAB(), scale, PLANE, args=args)[1] == (turns > 1)
+        assert _is_told(terms, ds.BAOAB(), scale, PLANE, args=args) == (turns > 1)
 
 
 def test_friction_that_changes_its_size_is_told_and_constant_friction_is_not():
     wall = lambda t, q, args: 5.0 * (1 + args * jnp.tanh(q) ** 2)
     terms = ds.langevin_terms(_free, wall, 1.0, (2,))
-    assert _told(terms, ds.BAOAB(), 1.0, PLANE, args=jnp.array(10.0))[1]
-    assert not _told(terms, ds.BAOAB(), 1.0, PLANE, args=jnp.array(0.1))[1]
+    assert _is_told(terms, ds.BAOAB(), 1.0, PLANE, args=jnp.array(10.0))
+    assert not _is_told(terms, ds.BAOAB(), 1.0, PLANE, args=jnp.array(0.1))
     # Masses change, and the friction does not.
     heavier = lambda t, p, q, args: jnp.sum(p**2 * jnp.exp(-3 * q)) / 2
     terms = ds.langevin_terms(heavier, 5.0, 1.0, (2,))
-    assert not _told(terms, ds.BAOAB(ds.ImplicitMidpoint()), 0.2, PLANE)[1]
+    assert not _is_told(terms, ds.BAOAB(ds.ImplicitMidpoint()), 0.2, PLANE)
 
 
 @pytest.mark.slow
@@ -172,9 +181,9 @@ def test_two_levels_of_friction_that_turns_far_agree_on_a_wrong_diffusion():
 
 def test_with_three_levels_the_order_is_checked_instead():
     terms = ds.langevin_terms(_well, 8.0, 1.0, (3,))
-    assert _told(terms, ds.SRKw5(), 0.2, REST)[1]
-    assert not _told(terms, ds.SRKw5(), 0.2, REST, levels=3)[1]
-    assert not _told(terms, ds.SRKw5(), 0.2, REST, levels=1)[1]
+    assert _is_told(terms, ds.SRKw5(), 0.2, REST)
+    assert not _is_told(terms, ds.SRKw5(), 0.2, REST, levels=3)
+    assert not _is_told(terms, ds.SRKw5(), 0.2, REST, levels=1)
 
 
 KICK = ds.noise_terms(lambda t, p, q, args: 0.1 * q, ())
@@ -189,8 +198,7 @@ def _is_told_of_drift(matrix, h, solver):
         return p, q
 
     terms = diffrax.MultiTerm(diffrax.ODETerm(drift), KICK)
-    phi = lambda t, y, args: y[0] ** 2
-    return _told(terms, solver, h, DISPLACED, phi)[1]
+    return _is_told(terms, solver, h, DISPLACED)
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-6, 1e6])
@@ -227,9 +235,7 @@ def test_a_lossy_mode_is_far_too_hot_on_both_levels_and_told():
     loss = diffrax.ODETerm(lambda t, y, args: (-rate * y[0], -rate * y[1]))
     phi = lambda t, y, args: y[0] ** 2
     terms = diffrax.MultiTerm(loss, kick)
-    sampling = ds.IndependentPaths(8192)
-    options = dict(sampling=sampling)
-    got, is_told = _told(terms, ds.AdditiveGauss(), 1.0, DISPLACED, phi, **options)
+    got, is_told = _estimate(terms, ds.AdditiveGauss(), 1.0, DISPLACED, phi, 8192)
     assert got.mean - T > 10 * got.error
     assert is_told
 
