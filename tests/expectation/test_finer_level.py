@@ -162,8 +162,8 @@ def test_many_means_do_not_raise_a_false_alarm():
 
 
 def test_three_levels_and_few_paths_take_no_trial():
-    assert _of_oscillator(1.0, levels=3)[1] is None
     few = ds.IndependentPaths(64)
+    assert _of_oscillator(1.0, levels=3, sampling=few)[1] is None
     assert _of_oscillator(1.0, sampling=few)[1] is None
 
 

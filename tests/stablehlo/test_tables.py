@@ -1,5 +1,7 @@
 """Arrays that all paths share stay in memory, and each path reads its own place."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -10,7 +12,6 @@ from jax import lax
 import diffrax_symplectic as ds
 
 from ..drjit_here import needs_drjit
-from ..families import slow_except
 from .replayed import replayed
 
 
@@ -87,11 +88,11 @@ def paths(name: str, engine: str, num_paths: int, dtype) -> ds.Ensemble:
 
 
 # As many paths as entries, fewer, and more.
+# Each potential in one precision, and the next in the other.
 @pytest.mark.parametrize(
-    "dtype", slow_except([jnp.float64], [jnp.float32, jnp.float64]), ids=["f32", "f64"]
-)
-@pytest.mark.parametrize(
-    "name", slow_except(["args", "in branches of several"], POTENTIALS)
+    "name, dtype",
+    zip(POTENTIALS, itertools.cycle([jnp.float64, jnp.float32])),
+    ids=POTENTIALS,
 )
 def test_paths_are_the_same_as_in_jax(name, dtype):
     for number in (300, 40, 700):

@@ -68,14 +68,12 @@ def test_dampings_fit_lattices_of_spins_and_take_their_precision():
         (ds.ImplicitMidpoint(), jnp.float64, 1e-13),
         pytest.param(ds.ImplicitMidpoint(), jnp.float32, 1e-5, marks=pytest.mark.slow),
         pytest.param(ds.NinomiyaVictoir(), jnp.float64, 1e-13, marks=pytest.mark.slow),
-        pytest.param(ds.LevyAreaMidpoint(), jnp.float64, 1e-13, marks=pytest.mark.slow),
         pytest.param(ds.PlateauGauss(), jnp.float64, 1e-13, marks=pytest.mark.slow),
     ],
     ids=[
         "ImplicitMidpoint",
         "float32",
         "NinomiyaVictoir",
-        "LevyAreaMidpoint",
         "PlateauGauss",
     ],
 )
