@@ -15,6 +15,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic import _solver
+from diffrax_symplectic._expectation import choose
 from diffrax_symplectic._solver import LANGEVIN, SOLVERS
 from diffrax_symplectic._terms import FRICTION
 from diffrax_symplectic._terms.constrained_drift import KEEP
@@ -42,9 +43,16 @@ DOCSTRINGS = {
 }
 
 
+@pytest.fixture
+def small_defaults(monkeypatch):
+    """Default sizes of a tenth: programs without optimization take long for each path."""
+    seconds = choose._SECONDS_OF_PATHS / 10
+    monkeypatch.setattr(choose, "_SECONDS_OF_PATHS", seconds)
+
+
 @pytest.mark.parametrize("name", DOCSTRINGS)
 @pytest.mark.slow
-def test_the_example_of_a_docstring_runs(name):
+def test_the_example_of_a_docstring_runs(name, small_defaults):
     for code in DOCSTRINGS[name]:
         exec(compile(textwrap.dedent(code), name, "exec"), {})
 
@@ -54,7 +62,9 @@ FIRST_PAGES = "README.md", "docs/index.md", "docs/concepts.md"
 
 
 @pytest.mark.parametrize("page", slow_except(FIRST_PAGES, PAGES))
-def test_code_of_a_page_runs_from_top_to_bottom(page, tmp_path, monkeypatch):
+def test_code_of_a_page_runs_from_top_to_bottom(
+    page, small_defaults, tmp_path, monkeypatch
+):
     # Pictures are drawn into files, outside the checkout.
     monkeypatch.setenv("MPLBACKEND", "Agg")
     monkeypatch.chdir(tmp_path)

@@ -41,9 +41,9 @@ _MOST_REMAINDER = 0.01
 _PATHS = 2**17
 # With a tolerance, which ends the estimate, the number of samples is without limit.
 _MOST_SAMPLES = 10**9
-# Without a tolerance, paths take no more than about this many seconds, so that a first call
-# ends while its user waits.
-_SECONDS = 10
+# Without a tolerance, paths take no more than about this many seconds on two cores, since
+# compiling, fits and checks take longer, and the user waits for all of them.
+_SECONDS_OF_PATHS = 3
 # Sorted paths are drawn and sorted before each step, which takes as long as this many
 # operations for each path.
 _OPERATIONS_OF_SORTING = 3000
@@ -222,7 +222,7 @@ def array_rqmc_for(problem: Problem, tol: float | None) -> ArrayRQMC | None:
 
 def _affordable_operations(problem: Problem) -> float:
     """The operations of each step for which there is time, for all paths together."""
-    return _SECONDS * OPERATIONS_PER_SECOND / _num_steps(problem)
+    return _SECONDS_OF_PATHS * OPERATIONS_PER_SECOND / _num_steps(problem)
 
 
 def trial_sampling(problem: Problem) -> AbstractSampling:

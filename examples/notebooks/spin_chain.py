@@ -41,7 +41,7 @@ def random_fields(t, s, T):
 path = ds.WeakBrownianPath((spins, 3), jr.key(0))
 terms = ds.spin_terms(exchange, random_fields, path, damping=alpha)
 up = jnp.zeros((spins, 3)).at[:, 2].set(1.0)
-ts = jnp.linspace(0, 30, 121)
+ts = jnp.linspace(0, 30, 151)  # ends of steps: other times are interpolated
 sol = diffrax.diffeqsolve(
     terms,
     ds.ImplicitMidpoint(),
@@ -58,7 +58,7 @@ print(f"lengths: off by at most {np.max(abs(np.linalg.norm(s, axis=2) - 1)):.0e}
 # %% The vertical component of each spin
 fig, ax = plt.subplots(figsize=(5, 2.5))
 picture = ax.imshow(s[:, :, 2].T, aspect="auto", cmap="RdBu", interpolation="nearest")
-ax.set_xticks(range(0, 121, 20), [f"{ts[i]:g}" for i in range(0, 121, 20)])
+ax.set_xticks(range(0, 151, 25), [f"{ts[i]:g}" for i in range(0, 151, 25)])
 ax.set(xlabel="t", ylabel="spin")
 fig.colorbar(picture)
 plt.show()
@@ -88,7 +88,7 @@ means = [
         y0=ds.to_spinors(up),
         args=jnp.array(T),
         key=jr.key(1),
-        sampling=ds.IndependentPaths(1000),
+        sampling=ds.IndependentPaths(400),
     )
     for T in temperatures
 ]
