@@ -7,10 +7,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import lineax as lx
 import numpy as np
 from jaxtyping import PyTree
 
 import diffrax_symplectic as ds
+
+
+def as_friction(matrix):
+    """A symmetric positive semidefinite matrix, as `langevin_terms` takes it."""
+    return lx.MatrixLinearOperator(jnp.asarray(matrix), lx.positive_semidefinite_tag)
 
 
 GENERAL = {

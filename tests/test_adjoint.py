@@ -20,7 +20,15 @@ from diffrax_symplectic._adjoint import (
 from diffrax_symplectic._solver import LANGEVIN, SOLVERS
 from diffrax_symplectic._tableau import FlatTableau, is_own_inverse, Stage
 
-from .problems import damped_terms, Given, H0, noise, random_problem, weak_path
+from .problems import (
+    as_friction,
+    damped_terms,
+    Given,
+    H0,
+    noise,
+    random_problem,
+    weak_path,
+)
 
 
 def separable_H0(t, p, q, args):
@@ -370,7 +378,8 @@ def test_friction_beside_a_flow_is_walked_back_too(inner, form):
     @jax.jit
     def gradients(gamma):
         def loss(y0, args, gamma, adjoint):
-            terms = make(gamma * form)
+            friction = gamma * form
+            terms = make(as_friction(friction) if form.ndim else friction)
             sol = diffrax.diffeqsolve(
                 terms, solver, 0.0, 2.0, 0.1, y0, args, adjoint=adjoint
             )

@@ -11,6 +11,7 @@ import pytest
 
 import diffrax_symplectic as ds
 
+from ..problems import as_friction
 from .messages import messages
 
 
@@ -117,7 +118,7 @@ def _turning(t, q, args):
     strong, turns = args
     c, s = jnp.cos(turns * q[0]), jnp.sin(turns * q[0])
     turn = jnp.array([[c, -s], [s, c]])
-    return strong * turn @ jnp.diag(jnp.array([1.0, 0.1])) @ turn.T
+    return as_friction(strong * turn @ jnp.diag(jnp.array([1.0, 0.1])) @ turn.T)
 
 
 def _free(t, p, q, args):

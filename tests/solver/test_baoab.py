@@ -15,7 +15,7 @@ from examples.hard_cases._ensemble import gaussian, weak
 from examples.hard_cases._stationary import stationary_bias, Step
 
 from ..families import slow_except
-from ..problems import damped_terms, Given, local_weak_orders, weak_path
+from ..problems import as_friction, damped_terms, Given, local_weak_orders, weak_path
 
 
 def _bath(sigma):
@@ -33,8 +33,8 @@ MATRIX = jnp.array([[1.0, 0.4], [0.4, 0.7]])
 SIGMA = jnp.array([[0.5, 0.1], [-0.3, 0.8]])
 FRICTIONS = {
     "each": jnp.array([0.7, 0.2]),
-    "matrix": MATRIX,
-    "positions": lambda t, q, args: MATRIX * jnp.cos(t + q[0] - q[1]),
+    "matrix": as_friction(MATRIX),
+    "positions": lambda t, q, args: as_friction(MATRIX * jnp.cos(t + q[0] - q[1])),
 }
 
 
@@ -93,11 +93,15 @@ def test_a_matrix_of_friction_is_that_of_its_own_axes():
         return [turn @ x[-1] for x in ends]
 
     matrix = turn.T @ jnp.diag(rates) @ turn
-    np.testing.assert_allclose(end(matrix, turn), end(rates, jnp.eye(3)), atol=1e-13)
-    # Arrays of momenta have matrices of twice their shape, in PyTrees as well.
+    turned = end(as_friction(matrix), turn)
+    np.testing.assert_allclose(turned, end(rates, jnp.eye(3)), atol=1e-13)
+    # A matrix for momenta in a PyTree is an operator on it.
     kinetic = lambda t, p, q, args: jnp.sum(p["x"] ** 2) / 2
-    shaped = ds.langevin_terms(kinetic, {"x": matrix.reshape(3, 1, 3, 1)})
     y0 = ({"x": jnp.ones((3, 1))},) * 2
+    blocks = {"x": {"x": matrix.reshape(3, 1, 3, 1)}}
+    struct = jax.eval_shape(lambda: y0[0])
+    tag = lx.positive_semidefinite_tag
+    shaped = ds.langevin_terms(kinetic, lx.PyTreeLinearOperator(blocks, struct, tag))
     p1, _ = _one_step(ds.BAOAB(), shaped, 0.1, y0)
     x = 0.05 * np.asarray(matrix)
     expected = np.linalg.solve(np.eye(3) + x, (np.eye(3) - x) @ np.ones(3))
@@ -115,7 +119,8 @@ def test_first_and_second_derivatives_by_a_matrix_with_equal_rates(solver):
     y0 = jnp.ones(2), jnp.zeros(2)
 
     def end(friction):
-        terms = damped_terms(_pendula, friction, _bath(SIGMA), weak_path(2))
+        given = as_friction(friction)
+        terms = damped_terms(_pendula, given, _bath(SIGMA), weak_path(2))
         adjoint = diffrax.DirectAdjoint()
         sol = diffrax.diffeqsolve(
             terms, solver, 0, 1, 0.25, y0, max_steps=4, adjoint=adjoint
@@ -137,7 +142,8 @@ def test_first_and_second_derivatives_by_a_matrix_with_equal_rates(solver):
 def test_momenta_fall_by_the_midpoint_rule_and_rise_again_backward(friction):
     # Of free particles with masses 1 and 4.
     H0 = lambda t, p, q, args: jnp.sum(p**2 / jnp.array([1.0, 4.0])) / 2
-    terms = ds.langevin_terms(H0, friction)
+    given = as_friction(friction) if jnp.ndim(friction) == 2 else friction
+    terms = ds.langevin_terms(H0, given)
     y0 = jnp.array([1.0, 2.0]), jnp.zeros(2)
     rates = np.eye(2) * friction if jnp.ndim(friction) < 2 else np.asarray(friction)
     x = rates / np.array([1.0, 4.0]) * 0.25 / 2
@@ -259,7 +265,7 @@ def test_gradients_may_walk_back_along_the_solution():
     assert _undoes_its_steps(ds.BAOAB(ds.StormerVerlet()))
     assert not _undoes_its_steps(ds.BAOAB(ds.SRKw4()))
     H0 = lambda t, p, q, args: _pendula(t, args * p, args * q, None)
-    terms = ds.langevin_terms(H0, MATRIX, 0.8, weak_path(2))
+    terms = ds.langevin_terms(H0, as_friction(MATRIX), 0.8, weak_path(2))
 
     def end(y0, args, adjoint):
         sol = diffrax.diffeqsolve(
@@ -277,7 +283,9 @@ def test_gradients_may_walk_back_along_the_solution():
 
 
 def test_backward_in_time_a_step_is_undone():
-    terms = ds.langevin_terms(_pendula, MATRIX, 0.8, Given(jnp.array([0.3, 0.1])))
+    terms = ds.langevin_terms(
+        _pendula, as_friction(MATRIX), 0.8, Given(jnp.array([0.3, 0.1]))
+    )
     y0 = jnp.ones(2), jnp.array([0.2, 0.4])
     solve = lambda t0, t1, y: [
         x[-1]

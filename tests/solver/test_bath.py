@@ -15,6 +15,8 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._compat import reversed_in_time
 from diffrax_symplectic._solver import bath
 
+from ..problems import as_friction
+
 
 N = 20
 _ROOT = jr.normal(jr.key(0), (N, N)) / N**0.5
@@ -33,7 +35,12 @@ def H0(t, p, q, args):
 
 
 def _friction_term(friction):
-    return ds.bath_terms(H0, friction).terms
+    """The term of a matrix, or of a function with matrices as values."""
+    if callable(friction):
+        at = lambda t, q, args: as_friction(friction(t, q, args))
+    else:
+        at = as_friction(friction)
+    return ds.bath_terms(H0, at).terms
 
 
 def _seen_by_a_solver(terms, backward: bool):
@@ -86,7 +93,7 @@ def test_modes_serve_what_is_the_same_at_all_times_and_positions_and_nothing_els
     assert modes(lambda t, q, args: (1 + t) * FULL) is None
     assert modes(lambda t, q, args: (1 + q[0] ** 2) * FULL) is None
     heavier = lambda t, p, q, args: (1 + q[0] ** 2) * jnp.sum(p**2)
-    terms = ds.bath_terms(heavier, FULL).terms
+    terms = ds.bath_terms(heavier, as_friction(FULL)).terms
     assert bath._matrices_if_constant(terms, 0.0, (P, Q), None) is None
     two = (*_friction_term(FULL), *_friction_term(PAIRS))
     assert bath._matrices_if_constant(two, 0.0, (P, Q), None) is None
@@ -119,13 +126,14 @@ def test_derivatives_are_those_of_the_equation_also_for_equal_rates(friction):
 
 _PROGRAM = """
 import jax, jax.numpy as jnp, jax.random as jr, diffrax, diffrax_symplectic as ds
+import lineax as lx
 jax.config.update("jax_enable_x64", True)
 n = 20
 H0 = lambda t, p, q, args: p @ p / 2 + jnp.sum(q**4)
 solver = ds.BAOAB()
-terms = ds.langevin_terms(
-    H0, lambda t, q, args: args, 1.0, solver.path((n,), jr.key(0))
-)
+def friction(t, q, args):
+    return lx.MatrixLinearOperator(args, lx.positive_semidefinite_tag)
+terms = ds.langevin_terms(H0, friction, 1.0, solver.path((n,), jr.key(0)))
 def solve(y0, friction):
     return diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0, friction).ys
 y0 = jnp.ones(n), jnp.ones(n)

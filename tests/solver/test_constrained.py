@@ -14,7 +14,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._solver.step import no_failure
 
 from ..drjit_here import needs_drjit
-from ..problems import Given
+from ..problems import as_friction, Given
 
 
 MASSES = jnp.array([1.0, 2.0, 0.5])[:, None]
@@ -410,7 +410,7 @@ def in_a_plane(path, stiffness, slow=False):
     potential = lambda t, q, args: q @ stiffness @ q / 2
     whole = lambda t, p, q, args: kinetic(t, p, q, args) + potential(t, q, args)
     plane = lambda q, args: jnp.stack([NORMAL @ q])
-    at = TENSOR, TEMPERATURE, path
+    at = as_friction(TENSOR), TEMPERATURE, path
     if slow:
         return ds.langevin_terms(kinetic, *at, constraint=plane, slow=potential)
     return ds.langevin_terms(whole, *at, constraint=plane)

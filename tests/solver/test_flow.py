@@ -13,7 +13,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from ..drjit_here import needs_drjit
-from ..problems import Given
+from ..problems import as_friction, Given
 
 
 KEY = jr.key(0)
@@ -77,7 +77,7 @@ def _harmonic(slow):
     K = jnp.asarray([[90.0, -30.0], [-30.0, 50.0]])
     masses = jnp.array([1.0, 3.0])
     H0 = lambda t, p, q, args: jnp.sum(p**2 / masses) / 2 + q @ K @ q / 2
-    friction = jnp.array([[0.9, 0.3], [0.3, 0.5]])
+    friction = as_friction([[0.9, 0.3], [0.3, 0.5]])
     path = ds.WeakBrownianPath((2,), KEY)
     terms = ds.langevin_terms(H0, friction, T, path, slow=slow)
     return terms, K, masses, ds.linear_flow(K, masses=masses)

@@ -14,7 +14,7 @@ from examples.hard_cases._ensemble import gaussian
 from examples.hard_cases._stationary import stationary_bias, Step
 
 from ..families import slow_except
-from ..problems import damped_terms, local_weak_orders, weak_path
+from ..problems import as_friction, damped_terms, local_weak_orders, weak_path
 
 
 MASS, T, STIFFNESS = 2.0, 0.5, 1.6
@@ -23,6 +23,7 @@ TENSOR = jnp.array([[1.0, 0.3, 0.0], [0.3, 0.5, -0.2], [0.0, -0.2, 0.7]])
 EACH = jnp.array([0.4, 1.0, 2.0])
 MASSES = jnp.array([1.0, 4.0, 0.5])
 MASS_MATRIX = jnp.diag(MASSES) + 0.3
+GIVEN = {"number": 0.7, "each": EACH, "matrix": as_friction(TENSOR)}
 FRICTIONS = {"number": 0.7, "each": EACH, "matrix": TENSOR}
 KINETIC = {
     "number": lambda p: jnp.sum(p**2) / 2,
@@ -99,7 +100,7 @@ def test_springs_of_any_friction_and_masses_keep_the_temperature(kinds, solver):
     springs = jnp.array([[2.0, 0.3, 0.1], [0.3, 1.0, 0.0], [0.1, 0.0, 1.5]])
     kinetic, h = KINETIC[masses], 0.4
     H0 = lambda t, p, q, args: kinetic(p) + q @ springs @ q / 2
-    terms = ds.langevin_terms(H0, FRICTIONS[friction], T, _path((3,)))
+    terms = ds.langevin_terms(H0, GIVEN[friction], T, _path((3,)))
     moments = stationary_moments(terms, solver, h, (jnp.zeros(3),) * 2)
     np.testing.assert_allclose(moments[3:, 3:] @ springs, T * np.eye(3), atol=1e-13)
     M = {"number": np.eye(3), "each": np.diag(MASSES), "matrix": MASS_MATRIX}[masses]
@@ -114,7 +115,7 @@ def test_springs_of_any_friction_and_masses_keep_the_temperature(kinds, solver):
 def test_free_particles_diffuse_as_einstein_says_for_any_step(friction, solver):
     G = FRICTIONS[friction]
     H0 = lambda t, p, q, args: KINETIC["each"](p)
-    terms = ds.langevin_terms(H0, G, T, _path((3,)))
+    terms = ds.langevin_terms(H0, GIVEN[friction], T, _path((3,)))
     # The rates of friction, which are those of a symmetric matrix.
     root_masses = np.sqrt(np.asarray(MASSES))
     rates = np.linalg.eigvalsh(_matrix(G) / np.outer(root_masses, root_masses))
@@ -168,7 +169,7 @@ def test_gradients_with_respect_to_a_friction_tensor_and_its_temperature():
     y0 = jnp.ones(3), jnp.array([0.3, -0.2, 0.5])
 
     def end(tensor, T):
-        terms = ds.langevin_terms(_pendula, tensor, T, weak_path(3))
+        terms = ds.langevin_terms(_pendula, as_friction(tensor), T, weak_path(3))
         return jnp.sum(_solved(ds.LangevinMiddle(), terms, y0) ** 2)
 
     change, k = jnp.array([[0.3, -0.2, 0.1], [-0.2, 0.5, 0.0], [0.1, 0.0, -0.4]]), 1e-5

@@ -6,6 +6,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import lineax as lx
 import numpy as np
 import pytest
 
@@ -13,7 +14,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._solver import LANGEVIN
 from diffrax_symplectic._terms import FRICTION, semidefinite_root
 
-from ..problems import Given, weak_path
+from ..problems import as_friction, Given, weak_path
 
 
 TENSOR = jnp.array([[1.0, 0.3, 0.0], [0.3, 0.5, -0.2], [0.0, -0.2, 0.7]])
@@ -33,11 +34,11 @@ def _at(q):
 FRICTIONS = {
     "number": (0.7, lambda q: 0.7 * np.eye(3)),
     "each": (jnp.array([0.4, 0.0, 2.0]), lambda q: np.diag([0.4, 0.0, 2.0])),
-    "matrix": (TENSOR, lambda q: TENSOR),
+    "matrix": (as_friction(TENSOR), lambda q: TENSOR),
     "number at q": (lambda t, q, args: _at(q[0]), lambda q: _at(q[0]) * np.eye(3)),
     "each at q": (lambda t, q, args: _at(q), lambda q: np.diag(_at(q))),
     "matrix at q": (
-        lambda t, q, args: _at(q[0]) * TENSOR,
+        lambda t, q, args: as_friction(_at(q[0]) * TENSOR),
         lambda q: _at(q[0]) * TENSOR,
     ),
     "along": (
@@ -81,7 +82,8 @@ def test_momenta_in_trees_have_frictions_and_temperatures_in_trees():
     p = {"a": jnp.arange(3.0), "b": jnp.array(2.0)}
     for friction, heat, forces, squares in (
         (0.5, T, (-0.25 * p["a"], -1.0), (T * np.eye(3), T)),
-        ({"a": TENSOR, "b": 3.0}, T, (-TENSOR @ p["a"] / 2, -6), (2 * T * TENSOR, 6 * T)),
+        ({"a": jnp.arange(3.0), "b": 3.0}, T, (-jnp.arange(3.0) * p["a"] / 2, -6),
+         (2 * T * np.diag(np.arange(3.0)), 6 * T)),
         (0.5, {"a": jnp.arange(3.0), "b": 0.0}, (-0.25 * p["a"], -1.0),
          (np.diag([0.0, 1.0, 2.0]), 0.0)),
     ):  # fmt: skip
@@ -114,7 +116,7 @@ def test_friction_between_particles_conserves_momentum(n):
     G = n * jnp.eye(n) - jnp.ones((n, n))
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2
     y0 = jnp.arange(n) / n, jnp.zeros(n)
-    for friction in (G, lambda t, q, args: G):
+    for friction in (as_friction(G), lambda t, q, args: as_friction(G)):
         path = ds.WeakBrownianPath((n,), jr.key(0))
         terms = ds.langevin_terms(H0, friction, 1.0, path)
         sol = diffrax.diffeqsolve(
@@ -213,6 +215,8 @@ def test_traced_frictions_and_temperatures_that_are_none_fail_alone(solver):
     @jax.jit
     @jax.vmap
     def run(friction, T):
+        if friction.ndim == 2:
+            friction = as_friction(friction)
         terms = ds.langevin_terms(_pendula, friction, T, given)
         return _end(terms, solver, y0)[1] == diffrax.RESULTS.successful
 
@@ -230,7 +234,7 @@ def test_traced_frictions_and_temperatures_that_are_none_fail_alone(solver):
 def test_every_other_solver_sees_friction_and_noise():
     # The end of a fine solution by Diffrax's solver, which all others approach.
     y0 = jnp.ones(3), jnp.array([0.3, -0.2, 0.5])
-    for friction in (TENSOR, lambda t, q, args: _at(q[0]) * TENSOR):
+    for friction in FRICTIONS["matrix"][0], FRICTIONS["matrix at q"][0]:
         path = diffrax.VirtualBrownianTree(
             0.0, 0.5, 1e-4, (3,), jr.key(2), levy_area=diffrax.SpaceTimeLevyArea
         )
@@ -283,9 +287,9 @@ def test_a_new_friction_or_temperature_of_the_same_shape_compiles_nothing():
     pairs = (
         (0.5, 0.3),
         (jnp.array([0.5, 1.0, 0.2]), 0.3),
-        (np.eye(3), jnp.array(0.4)),
+        (as_friction(np.eye(3)), jnp.array(0.4)),
     )
-    others = [(2 * friction, 3 * T) for friction, T in pairs]
+    others = [jax.tree.map(lambda x: 2 * x, pair) for pair in pairs]
     for friction, T in pairs:
         mean(friction, T)
     compiled = []
@@ -311,18 +315,20 @@ def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
         ((None, T, (3,)), "`friction` must be a number"),
         (
             (jnp.ones(2), T, (3,)),
-            r"friction of shape \(2,\) and a path of shape \(3,\)\. For momenta of shape "
-            r"\(2,\) pass a path of shape \(2,\).* matrix of shape \(3, 3\)",
+            r"the shape of the `path` and the momenta, \(3,\).*got shape \(2,\)",
         ),
+        ((jnp.eye(3), T, (3,)), r"Pass a matrix as `lineax.MatrixLinearOperator"),
         (
-            (jnp.eye(4), T, (2,)),
-            r"For momenta of shape \(4,\) pass a path of shape \(4,\)",
+            (as_friction(jnp.eye(4)), T, (2,)),
+            r"the shape of the `path` and the momenta, \(2,\); got one for shape \(4,\)",
         ),
+        ((lx.MatrixLinearOperator(TENSOR), T, (3,)), "tagged as positive semidefinite"),
         (([1.0, 0, 1.0], T, (3,)), r"got \[1.0, 0, 1.0\]. .*`jnp.array\(friction\)`"),
-        ((jnp.ones((3, 1)), T, (3, 3)), r"pass `friction \* jnp.ones\(\(3, 3\)\)`"),
-        ((negative,), "`friction` must be a symmetric positive semidefinite"),
-        ((negative, T, (2,)), "`friction` must be a symmetric positive semidefinite"),
-        ((jnp.abs(negative), T, (2,)), "`friction` must be a symmetric positive semi"),
+        ((as_friction(negative),), "`friction` must be a symmetric positive semidef"),
+        (
+            (as_friction(jnp.abs(negative)), T, (2,)),
+            "must be a symmetric positive semi",
+        ),
         (({"a": 1.0}, T, (3,)), "`friction` must be .* structure of the momenta"),
         ((lambda q: 1.0, T, (3,)), r"`friction\(t, q, args\)`"),
         ((1.0, -T, (3,)), "`temperature` must be a real number.*not negative"),
@@ -342,41 +348,57 @@ def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
         ((along, T, weak_path(3)), r"one noise for each direction.* shape \(2,\)"),
         ((ds.FrictionAlong(jnp.ones(3)), T, weak_path(3)), "and one more axis"),
         ((along, jnp.ones(2), weak_path(2)), "`temperature` must be one number"),
-        ((TENSOR, jnp.ones(3), weak_path(3)), "`temperature` must be one number"),
-        ((1.0, jnp.ones(2), weak_path(3)), "array of `temperature` must be a scalar"),
-        ((lambda t, q, args: q[:2], T, weak_path(3)), "array of `friction` must be"),
+        (
+            (as_friction(TENSOR), jnp.ones(3), weak_path(3)),
+            "`temperature` must be one number",
+        ),
+        ((1.0, jnp.ones(2), weak_path(3)), "array of `temperature` must have"),
+        ((lambda t, q, args: q[:2], T, weak_path(3)), "array of `friction` must have"),
         (([1.0, 0, 1.0],), r"`jnp.array\(friction\)`"),
         ((1.0, [T] * 3, weak_path(3)), r"`jnp.array\(temperature\)`"),
         (
-            (1.0, jnp.ones(1), weak_path(3)),
-            r"pass `temperature \* jnp.ones\(\(3,\)\)`",
+            (lambda t, q, args: lx.MatrixLinearOperator(TENSOR), T, weak_path(3)),
+            "tagged as positive semidefinite",
         ),
     ):
         with pytest.raises(ValueError, match=match):
             ds.BAOAB().init(make(*arguments), 0.0, 0.1, y0, None)
 
 
-@pytest.mark.parametrize("shape", [(4,), (4, 1)])
-def test_one_value_for_each_particle_is_told_how_to_be_repeated(shape):
-    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2
-    y0 = jnp.zeros((4, 3)), jnp.zeros((4, 3))
-    each = jnp.arange(1.0, 5.0).reshape(shape)
-    axes = "[:, None]" if shape == (4,) else ""
+def test_numbers_for_each_particle_are_repeated_along_the_axes_of_space():
+    masses = jnp.arange(1.0, 5.0)[:, None]
+    H0 = lambda t, p, q, args: jnp.sum(p**2 / masses) / 2 + jnp.sum(q**2)
+    y0 = jnp.ones((4, 3)), jnp.ones((4, 3))
 
     def solve(friction, temperature):
-        terms = ds.langevin_terms(
-            H0, friction, temperature, ds.WeakBrownianPath((4, 3), jr.key(0))
-        )
+        path = ds.WeakBrownianPath((4, 3), jr.key(0))
+        terms = ds.langevin_terms(H0, friction, temperature, path)
         return diffrax.diffeqsolve(terms, ds.BAOAB(), 0.0, 0.2, 0.1, y0).ys
 
-    def advice(name):
-        return re.escape(f"`{name}{axes} * jnp.ones((4, 3))`")
-
-    for given in (each, lambda t, q, args: each):
-        with pytest.raises(ValueError, match=advice("friction")):
+    whole = masses * jnp.ones((4, 3))
+    for friction in (masses, lambda t, q, args: masses):
+        got = solve(friction, masses / 2)
+        np.testing.assert_array_equal(got, solve(whole, whole / 2))
+    # One number for each axis, or for each particle: which of them is meant?
+    for given in (masses[:, 0], lambda t, q, args: masses[:, 0]):
+        with pytest.raises(ValueError, match=r"pass `friction\[:, None\]`"):
             solve(given, 1.0)
-        with pytest.raises(ValueError, match=advice("temperature")):
+        with pytest.raises(ValueError, match=r"pass `temperature\[:, None\]`"):
             solve(1.0, given)
-    # What the message says.
-    repeated = (each[:, None] if axes else each) * jnp.ones((4, 3))
-    assert np.all(np.isfinite(solve(repeated, repeated)))
+
+
+def test_a_matrix_for_momenta_with_two_axes_is_an_operator_on_their_structure():
+    n, d = 2, 3
+    flat = jr.normal(jr.key(5), (n * d, n * d))
+    flat = flat @ flat.T
+    q = jr.normal(jr.key(6), (n, d))
+    struct = jax.eval_shape(lambda: q)
+    tag = lx.positive_semidefinite_tag
+    operator = lx.PyTreeLinearOperator(flat.reshape(n, d, n, d), struct, tag)
+    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2
+    force, noise = ds.bath_terms(H0, operator, T, (n, d)).terms
+    dp, _ = force.vf(0.0, (q, q), None)
+    np.testing.assert_allclose(dp.ravel(), -flat @ q.ravel(), rtol=1e-13)
+    B, _ = noise.vf(0.0, (q, q), None)
+    B = B.reshape(n * d, n * d)
+    np.testing.assert_allclose(B @ B.T, 2 * T * flat, atol=1e-13)

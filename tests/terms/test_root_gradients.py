@@ -11,7 +11,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from ..families import slow_except
-from ..problems import Given
+from ..problems import as_friction, Given
 
 
 PAIR = jnp.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
@@ -21,15 +21,15 @@ CASES = {
     "number": (lambda a: a, lambda a: a * jnp.array([1.0, 0.0, 2.0])),
     "no temperature": (lambda a: a, lambda a: 0 * a),
     "array": (lambda a: a * jnp.array([1.0, 0.0, 2.0]), lambda a: a),
-    "matrix": (lambda a: a * PAIR, lambda a: a),
-    "zero matrix": (lambda a: 0 * a * PAIR, lambda a: a),
+    "matrix": (lambda a: as_friction(a * PAIR), lambda a: a),
+    "zero matrix": (lambda a: as_friction(0 * a * PAIR), lambda a: a),
     "large matrix": (
-        lambda a: a * jnp.zeros((MANY, MANY)).at[:3, :3].set(PAIR),
+        lambda a: as_friction(a * jnp.zeros((MANY, MANY)).at[:3, :3].set(PAIR)),
         lambda a: a,
     ),
     "wall": (lambda a: lambda t, q, args: a * jnp.maximum(q - 1, 0), lambda a: a),
     "matrix at q": (
-        lambda a: lambda t, q, args: a * jnp.maximum(q[2] - 1, 0) * PAIR,
+        lambda a: lambda t, q, args: as_friction(a * jnp.maximum(q[2] - 1, 0) * PAIR),
         lambda a: a,
     ),
     "heated side": (

@@ -1,8 +1,8 @@
 """Langevin dynamics: friction on velocities, and the noise of a temperature.
 
 - `terms`: `langevin_terms`, `bath_terms`, and the terms taken apart again.
-- `friction`: the forms of friction, a number, an array, a matrix or directions, and its
-  root in the noise.
+- `friction`: the forms of friction, numbers, a matrix or directions, and its root in the
+  noise.
 - `diffrax_langevin`: Diffrax's own Langevin terms, with their state `(x, v)`.
 """
 

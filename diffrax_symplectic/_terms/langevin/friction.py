@@ -1,5 +1,5 @@
-"""The forms of friction, a number, an array, a matrix or directions, and its root in the
-noise of a temperature."""
+"""The forms of friction, numbers, a matrix or directions, and its root in the noise of a
+temperature."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +9,7 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
-import numpy as np
+import lineax as lx
 from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
 
 from ..._arguments import check_takes, checked_not_negative, shapes
@@ -21,12 +21,22 @@ from ..evaluation import call_user_function
 
 # Momenta, velocities or positions: one array, or a PyTree of arrays.
 _Momenta = PyTree[Array]
-# A friction or a temperature, constant or a function.
+# A temperature, constant or a function.
 Value = (
     PyTree[ArrayLike] | Callable[[RealScalarLike, _Momenta, Args], PyTree[ArrayLike]]
 )
+# A friction, constant or a function, except for directions.
+FrictionValue = (
+    Value
+    | lx.AbstractLinearOperator
+    | Callable[[RealScalarLike, _Momenta, Args], lx.AbstractLinearOperator]
+)
 
 _EXPECTED = "a real number, an array or PyTree of them, or a function of `(t, q, args)`"
+_PASS_MATRIX = (
+    "a matrix as `lineax.MatrixLinearOperator(matrix, "
+    "lineax.positive_semidefinite_tag)`"
+)
 
 
 class FrictionAlong(AbstractCaller):
@@ -53,26 +63,25 @@ FrictionAlong.__init__.__doc__ = """**Arguments:**
 """
 
 
-class _MatrixOrNumbers(eqx.Module):
-    """A constant array that may be a matrix: whether it is one depends on the shape of its
-    momenta, which may be known only in the solve.
+class _Matrix(eqx.Module):
+    """A constant matrix of friction, with what would take long in every step.
 
-    - `value`: the array.
-    - `is_semidefinite`: whether it is symmetric positive semidefinite, as a matrix.
-    - `root`: its root as a matrix, computed once and not in every step.
+    - `operator`: the matrix.
+    - `root`: its root, for momenta as a vector.
+    - `is_semidefinite`: whether it is symmetric positive semidefinite.
     """
 
-    value: Array
+    operator: lx.AbstractLinearOperator
+    root: Float[Array, "n n"]
     is_semidefinite: Bool[Array, ""]
-    root: Array
 
 
-def value_at(name: str, value: Any, t, q: _Momenta, args: Args) -> PyTree:
+def value_at(name: str, value: Any, t, q: _Momenta, args: Args) -> Any:
     """The user's friction, temperature or directions, called `name` in messages: a
     constant, or the value of a function."""
-    return (
-        call_user_function(name, value, t, q, args=args) if callable(value) else value
-    )
+    if not callable(value):
+        return value
+    return call_user_function(name, value, t, q, args=args)
 
 
 def product_with(
@@ -85,8 +94,19 @@ def product_with(
         columns = _checked_columns(friction, t, q, args)
         parts = jtu.tree_leaves(jtu.tree_map(_speeds_along, columns, velocity))
         return jtu.tree_map(lambda directions: directions @ sum(parts), columns)
-    value = _value_for_each("friction", value_at("friction", friction, t, q, args), q)
-    return jtu.tree_map(_product, value, velocity, is_leaf=_may_be_matrix)
+    value = value_at("friction", friction, t, q, args)
+    if isinstance(value, _Matrix):
+        force = _product_with_matrix(value.operator, q, velocity)
+        return jtu.tree_map(
+            lambda x: jnp.where(value.is_semidefinite, x, jnp.nan), force
+        )
+    if isinstance(value, lx.AbstractLinearOperator):
+        # Whether it is semidefinite is seen when its root is taken.
+        return _product_with_matrix(value, q, velocity)
+    values = _checked_numbers("friction", value, q)
+    return jtu.tree_map(
+        lambda g, v: not_negative(in_precision_of(g, v)) * v, values, velocity
+    )
 
 
 def _speeds_along(directions: Array, v: Array) -> Array:
@@ -95,16 +115,12 @@ def _speeds_along(directions: Array, v: Array) -> Array:
     return jnp.tensordot(v, directions, axes=jnp.ndim(v))
 
 
-def _product(friction: Any, v: Array) -> Array:
-    """`G v` for the velocities of one array."""
-    value = friction.value if isinstance(friction, _MatrixOrNumbers) else friction
-    if not _is_matrix(value, jnp.shape(v)):
-        return not_negative(in_precision_of(value, v)) * v
-    force = jnp.tensordot(in_precision_of(value, v), v, axes=jnp.ndim(v))
-    if not isinstance(friction, _MatrixOrNumbers):
-        # Whether the value of a function is semidefinite is seen when its root is taken.
-        return force
-    return jnp.where(friction.is_semidefinite, force, jnp.nan)
+def _product_with_matrix(
+    operator: lx.AbstractLinearOperator, q: _Momenta, velocity: _Momenta
+) -> _Momenta:
+    _check_matrix(operator, q, "the momenta")
+    flat_v, unravel = jfu.ravel_pytree(velocity)
+    return unravel(in_precision_of(operator.as_matrix(), flat_v) @ flat_v)
 
 
 def root_product_with(
@@ -115,44 +131,52 @@ def root_product_with(
     if isinstance(friction, FrictionAlong):
         columns = _checked_columns(friction, t, q, args)
         return _noise_along(columns, _checked_single_temperature(T), control)
-    same_structure = jtu.tree_structure(control) == jtu.tree_structure(q)
-    if not same_structure or _shapes_of(control) != _shapes_of(q):
+    if not _same_shapes(control, q):
         raise ValueError(
             f"The `path` of `langevin_terms` must have the shape of `q`, {shapes(q)}; got "
             f"shape {shapes(control)}."
         )
-    value = _value_for_each("friction", value_at("friction", friction, t, q, args), q)
-    temperature = _value_for_each("temperature", T, q)
-    return jtu.tree_map(
-        _noise_of, value, temperature, control, q, is_leaf=_may_be_matrix
-    )
+    value = value_at("friction", friction, t, q, args)
+    if isinstance(value, _Matrix):
+        return _noise_of_matrix(value.root, T, control, q)
+    if isinstance(value, lx.AbstractLinearOperator):
+        _check_matrix(value, q, "the momenta")
+        return _noise_of_matrix(_root_of(value), T, control, q)
+    numbers = _checked_numbers("friction", value, q)
+    temperatures = _checked_numbers("temperature", T, q)
+
+    def kick(g: ArrayLike, T: ArrayLike, w: Array, x: Array) -> Array:
+        # Where either is negative, NaN makes the path fail.
+        scale = _root(in_precision_of(g, x)) * _root(2 * in_precision_of(T, x))
+        return scale * in_precision_of(w, x)
+
+    return jtu.tree_map(kick, numbers, temperatures, control, q)
+
+
+def _same_shapes(a: PyTree, b: PyTree) -> bool:
+    """Whether two PyTrees have the same structure and shapes."""
+    same_structure = jtu.tree_structure(a) == jtu.tree_structure(b)
+    return same_structure and _shapes_of(a) == _shapes_of(b)
 
 
 def _shapes_of(tree: PyTree) -> list[tuple[int, ...]]:
     return [jnp.shape(leaf) for leaf in jtu.tree_leaves(tree)]
 
 
-def _noise_of(friction: Any, T: ArrayLike, w: Array, x: Array) -> Array:
-    """`B W` for the momenta of one array, in the shape of the positions `x`, with their
-    friction, temperature and increments `w`."""
-    w = in_precision_of(w, x)
-    has_root = isinstance(friction, _MatrixOrNumbers)
-    value = friction.value if has_root else friction
-    if _is_matrix(value, jnp.shape(x)):
-        scale = _root(2 * in_precision_of(_checked_single_temperature(T), x))
-        if has_root:
-            root = friction.root
-        else:
-            root = semidefinite_root(in_precision_of(value, x))
-        return scale * jnp.tensordot(in_precision_of(root, x), w, axes=jnp.ndim(w))
-    if jnp.shape(T) not in ((), jnp.shape(x)):
-        raise ValueError(
-            "An array of `temperature` must be a scalar, or have the shape of its momenta, "
-            f"{jnp.shape(x)}; got shape {jnp.shape(T)}."
-            f"{_broadcast_advice('temperature', jnp.shape(T), jnp.shape(x))}"
-        )
-    # Where either is negative, NaN makes the path fail.
-    return _root(in_precision_of(value, x)) * _root(2 * in_precision_of(T, x)) * w
+def _root_of(operator: lx.AbstractLinearOperator) -> Float[Array, "n n"]:
+    matrix = operator.as_matrix()
+    return semidefinite_root(jnp.asarray(matrix, jnp.result_type(matrix, float)))
+
+
+def _noise_of_matrix(
+    root: Float[Array, "n n"], T: PyTree, control: BM, q: _Momenta
+) -> _Momenta:
+    """`sqrt(2 T) L W` in the shapes of the positions, with the root `L` of the friction."""
+    flat_q, unravel = jfu.ravel_pytree(q)
+    flat_w, _ = jfu.ravel_pytree(control)
+    scale = _root(2 * in_precision_of(_checked_single_temperature(T), flat_q))
+    w = in_precision_of(flat_w, flat_q)
+    return unravel(scale * (in_precision_of(root, flat_q) @ w))
 
 
 def _noise_along(columns: _Momenta, T: ArrayLike, control: BM) -> _Momenta:
@@ -195,76 +219,71 @@ def _checked_columns(friction: FrictionAlong, t, q: _Momenta, args: Args) -> _Mo
     return jtu.tree_map(in_precision_of, columns, q)
 
 
-def _is_matrix(value: ArrayLike, momenta_shape: tuple[int, ...]) -> bool:
-    """Whether this is a matrix for momenta of this shape, and not a number or an array of
-    them. Raises a `ValueError` if it is neither."""
-    if jnp.shape(value) in ((), momenta_shape):
-        return False
-    if jnp.shape(value) != momenta_shape * 2:
-        raise ValueError(
-            "An array of `friction` must be a scalar, or have the shape of its momenta, "
-            f"{momenta_shape}, or as a matrix the shape {momenta_shape * 2}; got shape "
-            f"{jnp.shape(value)}."
-            f"{_broadcast_advice('friction', jnp.shape(value), momenta_shape)}"
-        )
-    return True
+def _checked_numbers(
+    name: str, value: PyTree, momenta: PyTree, which: str = "its momenta"
+) -> PyTree:
+    """The user's argument `name`, a friction or a temperature by numbers, for each array of
+    the `momenta`, or of a path, as `which` says for messages. Raises a `ValueError` unless
+    it is a number or an array that repeats along axes of these."""
+    values = _value_for_each(name, value, momenta)
+    for x, of_momenta in zip(jtu.tree_leaves(values), jtu.tree_leaves(momenta)):
+        _check_broadcasts(name, jnp.shape(x), jnp.shape(of_momenta), which)
+    return values
 
 
-def _broadcast_advice(
-    name: str, shape: tuple[int, ...], momenta_shape: tuple[int, ...]
-) -> str:
-    """What to pass instead of an array of this shape if NumPy would broadcast it, which is
-    not done here: the shape of a matrix and that of momenta could not be told apart. Also
-    if it has one value for each particle, the first axis of the momenta."""
+def _check_broadcasts(
+    name: str, shape: tuple[int, ...], momenta_shape: tuple[int, ...], which: str
+) -> None:
+    """Raises a `ValueError` unless an array of this shape has one number for all momenta,
+    or as many axes as these, each as long as theirs or one. (NumPy would also add axes in
+    front. So for three particles in space `(3,)` would be one number for each axis of
+    space, and more often one for each particle is meant.)"""
+    fits = len(shape) == len(momenta_shape) and all(
+        length in (1, of_momenta) for length, of_momenta in zip(shape, momenta_shape)
+    )
+    if shape == () or fits:
+        return
     advice = ""
     if len(momenta_shape) > 1 and shape == momenta_shape[:1]:
         axes = ", ".join([":"] + ["None"] * (len(momenta_shape) - 1))
-        advice += (
-            " If it has one value for each particle, pass "
-            f"`{name}[{axes}] * jnp.ones({momenta_shape})`."
-        )
-    if _broadcasts(shape, momenta_shape):
-        advice += (
-            f" To repeat it along an axis, pass `{name} * jnp.ones({momenta_shape})`."
-        )
-    return advice
-
-
-def _broadcasts(shape: tuple[int, ...], momenta_shape: tuple[int, ...]) -> bool:
-    """Whether NumPy would repeat an array of this shape to that of the momenta."""
-    try:
-        return np.broadcast_shapes(shape, momenta_shape) == momenta_shape
-    except ValueError:
-        return False
-
-
-def _check_fits_path(friction: ArrayLike, path_shape: tuple[int, ...]) -> None:
-    """Raises a `ValueError` if an array of friction and a path of this shape belong to
-    momenta of different shapes. Before the solve it is not known which of them is wrong."""
-    shape = jnp.shape(friction)
-    # An array that NumPy would broadcast is wrong by itself, and the path is right.
-    if shape in ((), path_shape, path_shape * 2) or _broadcasts(shape, path_shape):
-        return
-    # A matrix has the shape of its momenta twice.
-    half = shape[: len(shape) // 2]
-    momenta_shape = half if shape == half * 2 else shape
+        advice += f" For one number for each particle pass `{name}[{axes}]`."
+    if name == "friction" and len(shape) > 1:
+        advice += f" Pass {_PASS_MATRIX}."
     raise ValueError(
-        "`friction` and the `path` of `langevin_terms` must be those of the same momenta; "
-        f"got friction of shape {shape} and a path of shape {path_shape}. For momenta of "
-        f"shape {momenta_shape} pass a path of shape {momenta_shape}, one noise for each "
-        f"momentum. For momenta of shape {path_shape} pass friction of that shape, or a "
-        f"matrix of shape {path_shape * 2}."
-        f"{_broadcast_advice('friction', shape, path_shape)}"
+        f"An array of `{name}` must have the shape of {which}, {momenta_shape}, in which "
+        f"any axis may have length one, or be a single number; got shape {shape}.{advice}"
     )
+
+
+def _check_matrix(
+    operator: lx.AbstractLinearOperator, momenta: PyTree, which: str
+) -> None:
+    """Raises a `ValueError` unless the operator is tagged as positive semidefinite, and
+    maps PyTrees with the structure and shapes of `momenta` to themselves. `which` says for
+    the message what these are."""
+    if not lx.is_positive_semidefinite(operator):
+        raise ValueError(
+            "The operator of `friction` must be tagged as positive semidefinite: pass "
+            f"{_PASS_MATRIX}."
+        )
+    structure = operator.in_structure()
+    if not _same_shapes(structure, momenta):
+        raise ValueError(
+            f"The operator of `friction` must act on arrays with the shape of {which}, "
+            f"{shapes(momenta)}; got one for shape {shapes(structure)}. For momenta of "
+            "shape `(n, d)` pass `lineax.PyTreeLinearOperator(array, jax.eval_shape("
+            "lambda: q), lineax.positive_semidefinite_tag)` with an array of shape "
+            "`(n, d, n, d)`."
+        )
 
 
 def _value_for_each(name: str, value: PyTree, p: _Momenta) -> PyTree:
     """The user's argument `name`, a value for each array of momenta, in the structure of
     the momenta `p`: a single value is that of each array. Raises a `ValueError` if it has
     another structure."""
-    if jtu.all_leaves([value], is_leaf=_may_be_matrix):
+    if jtu.all_leaves([value]):
         return jtu.tree_map(lambda _: value, p)
-    if jtu.tree_structure(value, is_leaf=_may_be_matrix) != jtu.tree_structure(p):
+    if jtu.tree_structure(value) != jtu.tree_structure(p):
         # The momenta may be given by their shapes.
         momenta = eqx.tree_pformat(p, struct_as_array=True)
         advice = ""
@@ -312,90 +331,60 @@ def in_precision_of(x: ArrayLike, other: Array) -> Array:
     return jnp.asarray(x, jnp.result_type(other))
 
 
-def _may_be_matrix(x: Any) -> bool:
-    return isinstance(x, _MatrixOrNumbers)
-
-
 def checked_friction(
     friction: Any, path_struct: PyTree[jax.ShapeDtypeStruct] | None
 ) -> Any:
-    """The friction with the roots of constant matrices, for a path with increments like
+    """The friction, with the root of a constant matrix, for a path with increments like
     `path_struct`, or without a path. Raises a `ValueError` if it is known to be invalid."""
     if isinstance(friction, FrictionAlong):
         if callable(friction.directions):
             check_takes("directions", friction.directions, "t", "q", "args")
         return jtu.tree_map(_as_array_or_function, friction)
+    if isinstance(friction, lx.AbstractLinearOperator):
+        return _checked_matrix(friction, path_struct)
     if callable(friction):
         check_takes("friction", friction, "t", "q", "args")
         return friction
     if len(jtu.tree_leaves(friction)) == 0:
         raise ValueError(
-            "`friction` must be a number, an array, a PyTree of arrays, a `FrictionAlong`, "
-            f"or a function `(t, q, args)`; got {friction!r}."
+            "`friction` must be a number, an array, a PyTree of arrays, a matrix as an "
+            "operator of Lineax, a `FrictionAlong`, or a function `(t, q, args)`; got "
+            f"{friction!r}."
         )
-    if path_struct is None:
-        # The shapes of the momenta are known in the solve only, so a single value is kept
-        # as one for all arrays of momenta.
-        return jtu.tree_map(
-            lambda value: _checked_friction_of_array(value, None), friction
+    if path_struct is not None:
+        # Which of them is wrong, if they differ, is not known before the solve.
+        _checked_numbers(
+            "friction", friction, path_struct, "the `path` and the momenta"
         )
-    if jtu.all_leaves([friction]):
-        # One friction for all arrays of momenta, whose shape is known if they share it.
-        path_shapes = {leaf.shape for leaf in jtu.tree_leaves(path_struct)}
-        momenta_shape = path_shapes.pop() if len(path_shapes) == 1 else None
-        return _checked_friction_of_array(friction, momenta_shape)
-    # The path has the shapes of the momenta.
-    friction_of_each = _value_for_each("friction", friction, path_struct)
-    return jtu.tree_map(
-        lambda value, leaf: _checked_friction_of_array(value, leaf.shape),
-        friction_of_each,
-        path_struct,
-    )
+
+    def checked(numbers: ArrayLike) -> Array:
+        return jnp.asarray(
+            checked_not_negative("friction", numbers, expected=_EXPECTED)
+        )
+
+    return jtu.tree_map(checked, friction)
 
 
 def _as_array_or_function(x: Any) -> Any:
     return x if callable(x) else jnp.asarray(x)
 
 
-def _checked_friction_of_array(
-    friction: ArrayLike, momenta_shape: tuple[int, ...] | None
-) -> Array | _MatrixOrNumbers:
-    """The friction of an array of momenta, whose shape is that of their path, or `None` if
-    it is not known. Raises a `ValueError` if the friction is known to be invalid."""
-    must_be_matrix = False
-    if momenta_shape is not None:
-        _check_fits_path(friction, momenta_shape)
-        must_be_matrix = _is_matrix(friction, momenta_shape)
-    if _has_shape_of_matrix(friction):
-        return _checked_matrix_or_numbers(friction, must_be_matrix)
-    return jnp.asarray(checked_not_negative("friction", friction, expected=_EXPECTED))
-
-
-def _has_shape_of_matrix(friction: ArrayLike) -> bool:
-    """Whether an array may be a matrix, which has the shape of its momenta twice."""
-    shape = jnp.shape(friction)
-    half = shape[: len(shape) // 2]
-    return len(half) > 0 and shape == half * 2
-
-
-def _checked_matrix_or_numbers(
-    friction: ArrayLike, must_be_matrix: bool
-) -> _MatrixOrNumbers:
-    """The friction with its root as a matrix. Raises a `ValueError` if its values are known
-    to be invalid: for a matrix, or if it need not be one, for numbers, too."""
-    root = semidefinite_root(jnp.asarray(friction, jnp.result_type(friction, float)))
+def _checked_matrix(
+    operator: lx.AbstractLinearOperator,
+    path_struct: PyTree[jax.ShapeDtypeStruct] | None,
+) -> _Matrix:
+    """The matrix with its root. Raises a `ValueError` if it is known to be invalid."""
+    # Without a path the shapes of the momenta are known in the solve only.
+    momenta = operator.in_structure() if path_struct is None else path_struct
+    _check_matrix(operator, momenta, "the `path` and the momenta")
+    root = _root_of(operator)
     is_semidefinite = ~jnp.any(jnp.isnan(root))
-    matrix_or_numbers = _MatrixOrNumbers(jnp.asarray(friction), is_semidefinite, root)
-    if is_traced(is_semidefinite):
-        return matrix_or_numbers
-    # Without the shape of the momenta the array may be valid as numbers.
-    may_be_numbers = not must_be_matrix and bool(np.all(np.asarray(friction) >= 0))
-    if not is_semidefinite and not may_be_numbers:
+    if not is_traced(is_semidefinite) and not is_semidefinite:
         raise ValueError(
-            "`friction` must be a symmetric positive semidefinite matrix, or an array of "
-            f"numbers that are not negative, one for each momentum; got {friction!r}."
+            "`friction` must be a symmetric positive semidefinite matrix; got "
+            f"{operator.as_matrix()}."
         )
-    return matrix_or_numbers
+    return _Matrix(operator, root, is_semidefinite)
 
 
 def checked_temperature(temperature: Any) -> Any:
@@ -412,15 +401,14 @@ def checked_temperature(temperature: Any) -> Any:
 
 # With `jit` this function is traced and compiled once for each shape.
 @jax.jit
-def semidefinite_root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
+def semidefinite_root(square: Float[Array, "n n"]) -> Float[Array, "n n"]:
     r"""$L$ with $L L^\top$ equal to a symmetric positive semidefinite matrix: its Cholesky
     factor, with zero columns where the matrix is singular. NaN if it is no such matrix.
 
     A column is zero if its pivot is a rounding error, whose root would be far larger than
     one: a friction between particles would then change their total momentum.
     """
-    n = round(matrix.size**0.5)
-    square = matrix.reshape(n, n)
+    n = len(square)
     eps = jnp.finfo(square.dtype).eps
     diagonal = jnp.diag(square)
     # The error of a pivot, which is a difference of numbers up to the diagonal entry.
@@ -450,7 +438,7 @@ def semidefinite_root(matrix: Float[Array, "..."]) -> Float[Array, "..."]:
     carry = jax.lax.fori_loop(0, n, with_column, carry, unroll=n <= 16)
     remainder, root, is_valid = carry
     is_valid = is_valid & jnp.all(jnp.abs(remainder) <= largest_remainder)
-    return jnp.where(is_valid, root, jnp.nan).reshape(matrix.shape)
+    return jnp.where(is_valid, root, jnp.nan)
 
 
 def _is_symmetric(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:

@@ -26,6 +26,7 @@ from .friction import (
     checked_friction,
     checked_temperature,
     FrictionAlong,
+    FrictionValue,
     product_with,
     root_product_with,
     Value,
@@ -40,7 +41,7 @@ _Hamiltonian = Callable[[RealScalarLike, _Momenta, _Momenta, Args], PyTree[Array
 
 def langevin_terms(
     H0: _Hamiltonian,
-    friction: Value | FrictionAlong,
+    friction: FrictionValue | FrictionAlong,
     temperature: Value | None = None,
     path: diffrax.AbstractBrownianPath | PyTree | None = None,
     *,
@@ -91,13 +92,14 @@ def langevin_terms(
 
     - `H0`: `H0(t, p, q, args)`, as for [`diffrax_symplectic.hamiltonian_terms`][].
     - `friction`: the friction $G$, in units of force over velocity: a number; an array with
-        one number for each momentum, of the shape of `p`; or a symmetric positive
-        semidefinite matrix, with the shape of `p` twice, `(n, n)` for `n` momenta. For
-        momenta in a PyTree a number, or a PyTree of these. Or a function `(t, q, args)`
-        that returns one of these. Or a [`diffrax_symplectic.FrictionAlong`][].
+        the shape of `p`, in which any axis may have length one, such as `rate * masses` for
+        masses of shape `(n, 1)`; for momenta in a PyTree a PyTree of these; or a symmetric
+        positive semidefinite matrix, as an operator of Lineax that is tagged as such. Or a
+        function `(t, q, args)` that returns one of these. Or a
+        [`diffrax_symplectic.FrictionAlong`][].
     - `temperature`: the temperature $T$, in units of energy: a number; for friction by
-        numbers also one for each momentum, as an array or PyTree like `p`; or a function
-        `(t, q, args)` of these. `None` for friction without noise.
+        numbers also an array or PyTree, as for `friction`; or a function `(t, q, args)` of
+        these. `None` for friction without noise.
     - `path`: the Brownian path or its shape, as for
         [`diffrax_symplectic.hamiltonian_terms`][]: the shape of `q`, or `(m,)` for the `m`
         directions of a `FrictionAlong`. Of a
@@ -127,7 +129,7 @@ def langevin_terms(
 
 def bath_terms(
     H0: _Hamiltonian,
-    friction: Value | FrictionAlong,
+    friction: FrictionValue | FrictionAlong,
     temperature: Value | None = None,
     path: diffrax.AbstractBrownianPath | PyTree | None = None,
 ) -> diffrax.MultiTerm:
