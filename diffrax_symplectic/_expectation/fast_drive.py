@@ -11,6 +11,7 @@ from .._custom_types import Y
 from .._programs import compiled
 from .._simulation import Problem
 from .fields_in_time import all_fields, at_both_states, depends_on_time, Field
+from .linear_maps import spread_evenly
 
 
 # The most times that are looked at, spread over the interval: a pulse is seen if it is
@@ -20,9 +21,6 @@ _MOST_TIMES = 2**16
 _MOST_NUMBERS = 2**22
 _TIMES_IN_STEP = 16
 _FEWEST_STEPS = 2**6
-# Multiples of this number, without their whole parts, fill an interval evenly, and no
-# period repeats in step with them.
-_GOLDEN_RATIO = (1 + 5**0.5) / 2
 # How far fields depart from straight lines over a step, as a part of their whole change in
 # it, in the root mean square. A drive of frequency Omega reaches this at Omega h = 3.5 to
 # 4.1, with many and with 16 times in a step.
@@ -51,10 +49,11 @@ def unresolved_drive(problem: Problem) -> str | None:
     most_steps = max(_FEWEST_STEPS, most_times // _TIMES_IN_STEP)
     numbers = np.arange(problem.finest_steps)
     if len(numbers) > most_steps:
-        fractions = np.arange(most_steps) * _GOLDEN_RATIO % 1
-        numbers = np.unique(np.floor(fractions * problem.finest_steps))
+        spread = spread_evenly(most_steps) * problem.finest_steps
+        numbers = np.unique(np.floor(spread))
     times_in_step = max(_TIMES_IN_STEP, most_times // len(numbers))
-    fractions = np.sort(np.arange(1, times_in_step + 1) * _GOLDEN_RATIO % 1)
+    # Not the start of a step, which is the end of the one before.
+    fractions = np.sort(spread_evenly(times_in_step + 1)[1:])
     times = float(problem.t0) + h * (numbers[:, None] + fractions)
     departure = _quick_departure(field, problem.y0, times.astype(problem.dtype))
     if not float(departure) > _UNRESOLVED:

@@ -20,6 +20,7 @@ from .._terms import (
     split_terms,
     without_constraint,
 )
+from .linear_maps import arbitrary_direction
 
 
 # A vector field at a time and a state. (A `jax.tree_util.Partial`, so that the terms in it
@@ -81,7 +82,7 @@ def _drift_field(terms: Terms, args: Args, t: Array, y: Y) -> Float[Array, " n"]
 
 def _noise_field(terms: Terms, args: Args, t: Array, y: Y) -> Float[Array, " n"]:
     zeros, unravel = zeros_and_unravel([control_struct(term, t) for term in terms])
-    controls = unravel(jnp.cos(1.0 + jnp.arange(zeros.size, dtype=zeros.dtype)))
+    controls = unravel(arbitrary_direction(zeros.size, zeros.dtype))
     return jfu.ravel_pytree(apply(terms, controls, args, t, y))[0]
 
 
@@ -103,7 +104,7 @@ def _moved(y0: Y) -> Y:
         x = jnp.asarray(x)
         largest = jnp.max(jnp.abs(x), initial=0)
         size = jnp.where(largest > 0, largest, 1)
-        direction = jnp.cos(1.0 + jnp.arange(x.size, dtype=x.dtype))
+        direction = arbitrary_direction(x.size, x.dtype)
         return x + size * direction.reshape(x.shape)
 
     return jtu.tree_map(moved_leaf, y0)

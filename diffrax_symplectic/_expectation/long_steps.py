@@ -2,7 +2,7 @@
 start."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import jax
@@ -32,6 +32,7 @@ from .._terms import (
     split_friction,
 )
 from .fields_in_time import depends_on_time, drift_field
+from .linear_maps import derivative_at, Growth, largest_growth, spread_evenly
 
 
 # A step that enlarges a small change of the state by more than this, and turns it around,
@@ -76,24 +77,6 @@ _ROUNDING = 1e-6
 _MOST_MODES = 256
 # The number of steps to look at where the drift depends on time.
 _NUM_TIMES = 64
-# Multiples of this number, without their whole parts, fill an interval evenly, and a drift
-# that is periodic in time does not repeat in step with them.
-_GOLDEN_RATIO = (1 + 5**0.5) / 2
-
-
-class _Growth(NamedTuple):
-    """How a linear map enlarges a change of the state, applied to it again and again.
-
-    - `change`: the change, scaled to length one.
-    - `log_growth`: the logarithm of the factor by which it grew each time, in the mean over
-        the times that count.
-    - `along_itself`: the scalar product of the change after the last time with the one
-        before it. It is negative if the map turned the change around.
-    """
-
-    change: Float[Array, "*times n"]
-    log_growth: Float[Array, "*times"]
-    along_itself: Float[Array, "*times"]
 
 
 def too_long_steps(problem: Problem, dt0: float) -> str | None:
@@ -255,9 +238,8 @@ def _numbers_of_steps(problem: Problem) -> Float[np.ndarray, " times"]:
     field = drift_field(drift, problem.args)
     if not drift or not depends_on_time(field, problem, problem.y0):
         return np.zeros(1, problem.dtype)
-    fractions = np.arange(_NUM_TIMES) * _GOLDEN_RATIO % 1
     num_steps = int(problem.level(0).num_steps)
-    return np.floor(fractions * num_steps).astype(problem.dtype)
+    return np.floor(spread_evenly(_NUM_TIMES) * num_steps).astype(problem.dtype)
 
 
 def _place(problem: Problem, number: float) -> str:
@@ -308,24 +290,21 @@ def _short_step_succeeds(problem: Problem) -> Bool[Array, ""]:
     return success & jnp.all(jnp.isfinite(problem.values(problem.t0, y)))
 
 
-def _growth(problem: Problem, numbers: Float[Array, " times"]) -> _Growth:
+def _growth(problem: Problem, numbers: Float[Array, " times"]) -> Growth:
     """The growth of the change that a step from `y0` enlarges most, by the derivative of
     the step; for the steps with these numbers."""
     h = problem.level(0).h
     terms = _terms_without_noise(problem, h)
     flat_y0, unravel = jfu.ravel_pytree(problem.y0)
 
-    def growth_in_step(number: Float[Array, ""]) -> _Growth:
+    def growth_in_step(number: Float[Array, ""]) -> Growth:
         def step(x: Array) -> Array:
             y = unravel(x)
             state = problem.init(terms, number, h, y)
             y1, *_ = problem.step(terms, number, h, y, state)
             return jfu.ravel_pytree(y1)[0]
 
-        def derivative(change: Array) -> Array:
-            return jax.jvp(step, (flat_y0,), (change,))[1]
-
-        return _largest_growth(derivative, flat_y0, _ITERATIONS)
+        return largest_growth(derivative_at(step, flat_y0), flat_y0, _ITERATIONS)
 
     # This compiles faster than `jax.vmap`, and takes less memory.
     return lax.map(growth_in_step, numbers)
@@ -396,43 +375,17 @@ def _frequency_of(
     """The largest angular frequency of the equation `dx/dt = rate_of(x)` near `x`; zero
     where growth without oscillation is faster."""
 
-    def derivative(_, change: Array) -> Array:
-        return jax.jvp(rate_of, (x,), (change,))[1]
+    derivative = derivative_at(rate_of, x)
 
     # An oscillation has a pair of eigenvalues, i omega and -i omega. Applied twice, the
     # derivative has -omega^2 in the whole plane of the oscillation. (In a loop, it is
     # compiled once.)
     def derivative_twice(change: Array) -> Array:
-        return lax.fori_loop(0, 2, derivative, change)
+        return lax.fori_loop(0, 2, lambda _, change: derivative(change), change)
 
-    growth = _largest_growth(derivative_twice, x, _ITERATIONS_FOR_FREQUENCY)
+    growth = largest_growth(derivative_twice, x, _ITERATIONS_FOR_FREQUENCY)
     oscillates = growth.along_itself < 0
     return jnp.where(oscillates, jnp.exp(growth.log_growth / 2), 0)
-
-
-def _largest_growth(
-    linear: Callable[[Array], Array], like: Float[Array, " n"], iterations: int
-) -> _Growth:
-    """The growth of the change that a linear map enlarges most, by power iteration: after
-    this many applications of the map, over as many more."""
-
-    def after_map(number: Array, before: _Growth) -> _Growth:
-        change = linear(before.change)
-        # The change before the map has length one, so this is its growth.
-        length = jnp.linalg.norm(change)
-        counted_log = jnp.where(number < iterations, 0.0, jnp.log(length))
-        log_growth = before.log_growth + counted_log / iterations
-        along_itself = before.change @ change
-        # Without a drift, as between two pulses, nothing is left of a change.
-        scaled = jnp.where(length > 0, change / length, before.change)
-        return _Growth(scaled, log_growth, along_itself)
-
-    # An arbitrary direction, without the symmetries that a problem may have: it contains
-    # the one that grows most.
-    direction = jnp.cos(1.0 + jnp.arange(like.size, dtype=like.dtype))
-    zero = jnp.zeros((), like.dtype)
-    start = _Growth(direction / jnp.linalg.norm(direction), zero, zero)
-    return lax.fori_loop(0, 2 * iterations, after_map, start)
 
 
 _quick_growth = compiled(_growth, quickly=True)

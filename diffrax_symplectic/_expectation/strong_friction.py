@@ -32,13 +32,15 @@ from .._terms import (
     tree_sum,
 )
 from .fields_in_time import drift_field
+from .linear_maps import derivative_at, largest_growth
 
 
 # With a flow, a mode that turns by more than this in a step, and whose momentum decays at
 # more than this rate times the step, relaxes too slowly: from friction and frequencies of 2
 # in units of 1 / h on, a step takes its position to the other side.
 _RESOLVED = 2.0
-_ITERATIONS = 30
+# Of power iteration, before and after what counts.
+_ITERATIONS = 15
 # Where friction changes along a step by more than the first number, and over `dt0` damps
 # momenta at more than the second, two levels may be wrong together. Measured for the mean
 # of q^2 of a free particle after 40 steps, with a friction tensor that turns with the
@@ -54,8 +56,6 @@ _VELOCITIES = 16
 _DOUBLINGS = 16
 # The cosine of the angle up to which changes count as parallel.
 _PARALLEL = 0.9
-
-_Linear = Callable[[Array], Array]
 
 
 class _Rates(NamedTuple):
@@ -237,16 +237,20 @@ def _rates(problem: Problem) -> _Rates:
         dp, _ = rate(drift, problem.t0, y, problem.args)
         return jfu.ravel_pytree(dp)[0]
 
-    def damped(change: Array) -> Array:
-        return jax.jvp(friction_force, (flat_p,), (change,))[1]
+    damped = derivative_at(friction_force, flat_p)
+    moved = derivative_at(velocity, flat_p)
+    pushed = derivative_at(force, flat_q)
 
     def accelerated(change: Array) -> Array:
-        moved = jax.jvp(velocity, (flat_p,), (change,))[1]
-        return jax.jvp(force, (flat_q,), (moved,))[1]
+        return pushed(moved(change))
 
-    # The eigenvalues of both are real for symmetric masses, friction and stiffness, and
-    # negative where friction damps and where the potential is stable.
-    return _Rates(_largest_decay(damped, flat_p), _largest_decay(accelerated, flat_p))
+    def decay(derivative: Callable[[Array], Array]) -> Float[Array, ""]:
+        # The eigenvalues are real for symmetric masses, friction and stiffness, and
+        # negative where friction damps and where the potential is stable.
+        growth = largest_growth(derivative, flat_p, _ITERATIONS)
+        return jnp.maximum(-growth.along_itself, 0)
+
+    return _Rates(decay(damped), decay(accelerated))
 
 
 def _decay(problem: Problem) -> Float[Array, ""]:
@@ -259,10 +263,8 @@ def _decay(problem: Problem) -> Float[Array, ""]:
     def rate_of_drift(x: Array) -> Array:
         return field(jnp.asarray(problem.t0), unravel(x))
 
-    def derivative(change: Array) -> Array:
-        return jax.jvp(rate_of_drift, (flat_y0,), (change,))[1]
-
-    change = _changing_most(derivative, flat_y0)
+    derivative = derivative_at(rate_of_drift, flat_y0)
+    change = largest_growth(derivative, flat_y0, _ITERATIONS).change
     once = derivative(change)
     twice = derivative(once)
     # An oscillation may be turned around once, if its parts have different units, but then
@@ -275,26 +277,6 @@ def _decay(problem: Problem) -> Float[Array, ""]:
 def _cosine(x: Float[Array, " n"], y: Float[Array, " n"]) -> Float[Array, ""]:
     """Of the angle between two vectors; not a number if one is zero."""
     return x @ y / (jnp.linalg.norm(x) * jnp.linalg.norm(y))
-
-
-def _largest_decay(derivative: _Linear, like: Float[Array, " n"]) -> Float[Array, ""]:
-    """Minus the eigenvalue of `derivative` that is largest in size, or zero if this
-    eigenvalue is positive."""
-    change = _changing_most(derivative, like)
-    return jnp.maximum(-(change @ derivative(change)), 0)
-
-
-def _changing_most(derivative: _Linear, like: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The change, of length one, that `derivative` changes most, by power iteration."""
-
-    def iterate(_, change: Array) -> Array:
-        image = derivative(change)
-        length = jnp.linalg.norm(image)
-        return jnp.where(length > 0, image / jnp.where(length > 0, length, 1), change)
-
-    # An arbitrary direction, without the symmetries that a problem may have.
-    start = jnp.cos(1.0 + jnp.arange(like.size, dtype=like.dtype))
-    return lax.fori_loop(0, _ITERATIONS, iterate, start / jnp.linalg.norm(start))
 
 
 _quick_rates = compiled(_rates, quickly=True)
