@@ -192,7 +192,6 @@ def suggest_solver(
     then by the size of the equations of a step. With friction, those with exact stationary
     positions come first for means, and if masses depend on positions
     `BAOAB(ImplicitMidpoint())`. `NinomiyaVictoir` comes last with more than four noises.
-    [Measured errors](advice.md) support this.
 
     **Arguments:**
 

@@ -3,11 +3,7 @@
 from . import (
     calls,
     ensemble,
-    growth,
-    many_paths,
-    members,
     speed,
-    step_sizes,
     tolerance,
     total_error,
     work_precision,
@@ -18,11 +14,7 @@ def main() -> None:
     speed.main()
     calls.main()
     ensemble.main()
-    growth.main()
-    many_paths.main("measure")
-    step_sizes.main("measure")
     tolerance.main()
-    members.main()
     work_precision.main("errors", "seconds")
     total_error.main("errors")
     total_error.main("seconds")

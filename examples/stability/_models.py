@@ -1,5 +1,6 @@
 """Linear models and the solvers that take them."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -8,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
+import optimistix as optx
 
 import diffrax_symplectic as ds
 
@@ -22,6 +24,27 @@ def gaussian(key, shape=()):
 
 def areas(key, shape=()):
     return ds.SRKs4().path(shape, key)
+
+
+def stationary(matrix: np.ndarray, forever: float) -> np.ndarray:
+    """The moments that `matrix`, of a step, or a generator with `forever = 0`, keeps."""
+    left = np.eye(len(matrix)) * forever - matrix
+    moments = np.zeros(len(matrix))
+    moments[0] = 1
+    rest, *_ = np.linalg.lstsq(left[1:, 1:], -left[1:, 0], rcond=None)
+    moments[1:] = rest
+    return moments
+
+
+def with_newton(solver):
+    """The solver with a root finder that is exact for linear systems, and compiled sooner.
+    The results are the same."""
+    if isinstance(solver, ds.BAOAB) and solver.flow is not None:
+        return dataclasses.replace(solver, flow=with_newton(solver.flow))
+    if hasattr(solver, "root_finder"):
+        newton = optx.Newton(rtol=1e-12, atol=1e-12)
+        return dataclasses.replace(solver, root_finder=newton)
+    return solver
 
 
 class Case(NamedTuple):

@@ -9,7 +9,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._solver import LANGEVIN, SOLVERS
 from diffrax_symplectic._suggest import FOR_MEANS, FOR_PATHS
 
-from ..advice import stationary, with_newton
+from ._models import stationary, with_newton
 from ._page import fill, Page, table
 
 

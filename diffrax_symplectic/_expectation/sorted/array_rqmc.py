@@ -92,10 +92,9 @@ class ArrayRQMC(AbstractSampling):
     sampling errors cancel. Each single path has exactly its own law, so the only bias of
     the estimate is the solver's.
 
-    The error decreases faster than one over the square root of the number of paths, much
-    faster for [few coordinates and smooth
-    $\phi$](benchmarks/sampling.md#gains-of-arrayrqmc); in chaos after long times it does
-    not.
+    The error decreases faster than one over the square root of the number of paths, [much
+    faster](expectation.md#choosing-the-arguments-of-arrayrqmc) for few coordinates and
+    smooth $\phi$; in chaos after long times it does not.
 
     **Arguments:**
 
