@@ -39,7 +39,7 @@ _FEWEST_TO_COMPARE = 2
 _LONGER = 2.0
 _SHORTER = 0.25
 # When parts get this short, the branch of solutions from the start of the step has turned
-# back. From then on Newton's method searches for any solution.
+# back: the step has no solution on it. Solutions on other branches are no steps.
 _SHORTEST = 1e-3
 
 
@@ -52,9 +52,8 @@ class Progress(NamedTuple):
     - `reached`, `target`: the last $s$ solved, and the $s$ being solved for.
     - `tries`: the number of iterations for this target.
     - `size`: the last correction, in units of the tolerance.
-    - `searching`: whether the branch of solutions from $s = 0$ was given up, so that any
-        solution of the full equations is accepted.
     - `is_solved`: whether the full equations are solved.
+    - `has_turned_back`: whether the branch of solutions from $s = 0$ ends before $s = 1$.
     """
 
     anchor: _Vector
@@ -62,13 +61,8 @@ class Progress(NamedTuple):
     target: Scalar
     tries: IntScalarLike
     size: Scalar
-    searching: Bool[Array, ""]
     is_solved: Bool[Array, ""]
-
-    @property
-    def is_hopeless(self) -> Bool[Array, ""]:
-        """Whether even the search for any solution has left the equations' domain."""
-        return self.searching & ~jnp.isfinite(self.size)
+    has_turned_back: Bool[Array, ""]
 
 
 class Newton(eqx.Module):
@@ -97,15 +91,15 @@ class Newton(eqx.Module):
             target=zero + 1,
             tries=jnp.array(0),
             size=zero,
-            searching=false,
             is_solved=false,
+            has_turned_back=false,
         )
         start, count = batched_like((start, jnp.array(0)), guess)
 
         def is_going(carry):
             count, _, progress = carry
             in_time = count < max_iterations
-            return in_time & ~progress.is_solved & ~progress.is_hopeless
+            return in_time & ~progress.is_solved & ~progress.has_turned_back
 
         def body(carry):
             count, k, progress = carry
@@ -113,8 +107,12 @@ class Newton(eqx.Module):
 
         _, k, progress = lax.while_loop(is_going, body, (count, guess, start))
         R: Any = optx.RESULTS
+        # Where steps leave the domain of the equations, the last correction is not finite.
+        no_solution = R.where(
+            jnp.isfinite(progress.size), R.nonlinear_divergence, R.nonfinite
+        )
         failure = R.where(
-            progress.is_hopeless, R.nonfinite, R.nonlinear_max_steps_reached
+            progress.has_turned_back, no_solution, R.nonlinear_max_steps_reached
         )
         return k, R.where(progress.is_solved, R.successful, failure)
 
@@ -153,8 +151,8 @@ class Newton(eqx.Module):
         is_solved = has_converged & is_whole_step & is_correct
 
         # The whole step at once is tried first, from a guess that may be poor. The last
-        # part of a continuation and the search begin near a solution, or fail soon.
-        is_first_try = is_whole_step & (progress.reached == 0) & ~progress.searching
+        # part of a continuation begins near a solution, or fails soon.
+        is_first_try = is_whole_step & (progress.reached == 0)
         patience = jnp.where(is_first_try, _PATIENCE, _FEWEST_TO_COMPARE)
         # A zero correction away from a solution is no progress either.
         is_due = tries >= patience
@@ -166,10 +164,7 @@ class Newton(eqx.Module):
         cannot_go_on = ~jnp.isfinite(size) | has_stopped | is_slow
         has_failed = cannot_go_on & ~part_is_solved & ~is_solved
         progress = progress._replace(tries=tries, size=size, is_solved=is_solved)
-        # A search goes on from where it is: there is no shorter part to go back to.
-        return _next_target(
-            progress, next_k, part_is_solved, has_failed & ~progress.searching
-        )
+        return _next_target(progress, next_k, part_is_solved, has_failed)
 
 
 def _next_target(
@@ -183,11 +178,8 @@ def _next_target(
     if Newton's method `has_failed`; and otherwise the same."""
     target = progress.target
     stride = progress.target - progress.reached
-    # If parts get too short, the branch of solutions has turned back.
-    has_turned_back = has_failed & (_SHORTER * stride < _SHORTEST)
     longer = jnp.minimum(target + _LONGER * stride, 1)
-    # A search for any solution is one for the full equations.
-    shorter = jnp.where(has_turned_back, 1, progress.reached + _SHORTER * stride)
+    shorter = progress.reached + _SHORTER * stride
     k = jnp.where(has_failed, progress.anchor, k)
     anchor = jnp.where(part_is_solved, k, progress.anchor)
     reached = jnp.where(part_is_solved, target, progress.reached)
@@ -197,5 +189,5 @@ def _next_target(
         reached=reached,
         target=jnp.where(part_is_solved, longer, same_or_shorter),
         tries=jnp.where(part_is_solved | has_failed, 0, progress.tries),
-        searching=progress.searching | has_turned_back,
+        has_turned_back=has_failed & (_SHORTER * stride < _SHORTEST),
     )

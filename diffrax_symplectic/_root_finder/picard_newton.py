@@ -63,8 +63,8 @@ class PicardNewton(
     linear systems are solved by elimination up to 32 unknowns, and by matrix-free GMRES
     above. If the corrections do not shrink, it solves a fraction of the time step, with the
     increments scaled alike, and continues from there part by part (continuation). If the
-    branch of solutions from the start of the step ends before the full step, Newton's
-    method searches for any other solution. A small correction does not count as convergence
+    branch of solutions from the start of the step ends before the full step, the step
+    fails. A small correction does not count as convergence
     if its linear system was not solved, or if the residual is larger than the state.
 
     **Arguments:**
