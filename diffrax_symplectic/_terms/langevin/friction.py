@@ -277,7 +277,7 @@ def _check_matrix(
         )
 
 
-def _value_for_each(name: str, value: PyTree, p: _Momenta) -> PyTree:
+def _value_for_each(name: str, value: PyTree, p: PyTree) -> PyTree:
     """The user's argument `name`, a value for each array of momenta, in the structure of
     the momenta `p`: a single value is that of each array. Raises a `ValueError` if it has
     another structure."""
