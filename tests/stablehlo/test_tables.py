@@ -91,7 +91,7 @@ def paths(name: str, engine: str, num_paths: int, dtype) -> ds.Ensemble:
 # Each potential in one precision, and the next in the other.
 @pytest.mark.parametrize(
     "name, dtype",
-    zip(POTENTIALS, itertools.cycle([jnp.float64, jnp.float32])),
+    [*zip(POTENTIALS, itertools.cycle([jnp.float64, jnp.float32]))],
     ids=POTENTIALS,
 )
 def test_paths_are_the_same_as_in_jax(name, dtype):
