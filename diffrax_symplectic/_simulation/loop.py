@@ -52,8 +52,11 @@ class PathStates(eqx.Module):
     ) -> "PathStates":
         """Paths before their first step. A path whose initial state is not finite has
         failed."""
-        failed = ~jax.vmap(all_finite)(starts.y0)
-        y = _replaced_where(failed, starts.y0, problem.y0)
+        # Without a barrier XLA checks a start that is constant, such as momenta at rest,
+        # while compiling: for 30,000 paths of 36 momenta this takes 3 seconds.
+        y0 = lax.optimization_barrier(starts.y0)
+        failed = ~jax.vmap(all_finite)(y0)
+        y = _replaced_where(failed, y0, problem.y0)
         return PathStates(y, solver_state, failed, starts.args, control)
 
     def after_step(
