@@ -29,6 +29,7 @@ FLOORS = [
 ]
 # Of the folders and modules in `_expectation`.
 FLOORS_OF_EXPECTATION = [
+    ("linear_maps", "progress"),
     ("sampling", "fields_in_time"),
     ("estimate", "batch", "cost", "kinks"),
     ("jumps", "fast_drive", "long_steps", "out_of_range", "strong_friction"),

@@ -6,7 +6,8 @@ In the order of a call of `expectation`:
 - `choose`: the sampling, if the user did not choose one, by `cost`, what a step costs, and
   `kinks`, whether `phi` is smooth; `long_steps`, whether steps are too long at `y0`;
   `strong_friction`, whether steps resolve the friction; `jumps`, whether forces jump at
-  their ends.
+  their ends; `fast_drive`, whether steps resolve a drive. `fields_in_time` and
+  `linear_maps` are what these look at.
 - `sampling`: what a sampling is. It makes a plan of how samples are taken.
 - `independent`, `sorted/`, `fitted/`: the samplings. Each simulates its paths by the loop
   over steps of `_simulation`; `fused_paths`: independent ones from a fused kernel.

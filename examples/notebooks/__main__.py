@@ -1,5 +1,5 @@
 """Runs the scripts in Jupyter and writes them as notebooks, with what they print and draw:
-`python -m examples.notebooks [--output folder]`. Needs the extra `docs`."""
+`python -m examples.notebooks [--output folder] [name ...]`. Needs the extra `docs`."""
 
 # The checks of types run without that extra.
 # pyright: reportMissingImports=false
@@ -36,11 +36,18 @@ def _cell(number: int, cell: Cell) -> nbformat.NotebookNode:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--output", type=Path, default=DOCS)
-    folder = parser.parse_args().output
+    names = [script.stem for script in SCRIPTS]
+    parser.add_argument("names", nargs="*", metavar="name", help=", ".join(names))
+    arguments = parser.parse_args()
+    if not set(arguments.names) <= set(names):
+        parser.error(f"the notebooks are {', '.join(names)}")
+    folder = arguments.output
     # `examples` sets it, for programs. In Jupyter pictures go into the notebook.
     os.environ.pop("MPLBACKEND", None)
     folder.mkdir(parents=True, exist_ok=True)
     for script in SCRIPTS:
+        if arguments.names and script.stem not in arguments.names:
+            continue
         begin = time.perf_counter()
         notebook = new_notebook(
             cells=[_cell(i, cell) for i, cell in enumerate(read_cells(script))],
