@@ -230,7 +230,7 @@ def test_a_double_well_in_the_plane_has_the_moments_of_gibbs(form):
     )
     friction = {
         "number": lambda t, q, args: 0.5 + q[0] ** 2,
-        "tensor": lambda t, q, args: 0.5 * jnp.eye(2) + jnp.outer(q, q),
+        "tensor": lambda t, q, args: as_friction(0.5 * jnp.eye(2) + jnp.outer(q, q)),
     }[form]
     x = np.linspace(-5, 5, 401)
     grid = np.stack(np.meshgrid(x, x, indexing="ij"))
