@@ -10,8 +10,13 @@ from jaxtyping import Array, Float
 from .._custom_types import Y
 from .._programs import compiled
 from .._simulation import Problem
-from .fields_in_time import all_fields, at_both_states, depends_on_time, Field
-from .linear_maps import spread_evenly
+from .fields_in_time import (
+    all_fields,
+    at_both_states,
+    depends_on_time,
+    Field,
+    spread_evenly,
+)
 
 
 # The most times that are looked at, spread over the interval: a pulse is seen if it is

@@ -6,6 +6,7 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
+import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from .._brownian import zeros_and_unravel
@@ -22,6 +23,10 @@ from .._terms import (
 )
 from .linear_maps import arbitrary_direction
 
+
+# Multiples of this number, without their whole parts, fill an interval evenly, and no
+# period repeats in step with them.
+_GOLDEN_RATIO = (1 + 5**0.5) / 2
 
 # A vector field at a time and a state. (A `jax.tree_util.Partial`, so that the terms in it
 # are arguments of programs.)
@@ -69,6 +74,11 @@ def at_both_states(field: Field, y0: Y) -> Callable[[Array], Float[Array, " n"]]
         return jax.vmap(field, in_axes=(None, 0))(t, y0_and_moved).reshape(-1)
 
     return at_both
+
+
+def spread_evenly(number: int) -> Float[np.ndarray, " number"]:
+    """So many times from 0 to 1, in units of an interval, the first of which is 0."""
+    return np.arange(number) * _GOLDEN_RATIO % 1
 
 
 def _force_field(terms: Terms, args: Args, t: Array, y: Y) -> Float[Array, " n"]:

@@ -5,14 +5,8 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
-
-
-# Multiples of this number, without their whole parts, fill an interval evenly, and nothing
-# that is periodic repeats in step with them.
-_GOLDEN_RATIO = (1 + 5**0.5) / 2
 
 
 class Growth(NamedTuple):
@@ -69,8 +63,3 @@ def derivative_at(
 def arbitrary_direction(size: int, dtype: Any) -> Float[Array, " size"]:
     """A direction without the symmetries that a problem may have."""
     return jnp.cos(1.0 + jnp.arange(size, dtype=dtype))
-
-
-def spread_evenly(number: int) -> Float[np.ndarray, " number"]:
-    """So many numbers from 0 to 1, the first of which is 0."""
-    return np.arange(number) * _GOLDEN_RATIO % 1

@@ -31,8 +31,8 @@ from .._terms import (
     rate,
     split_friction,
 )
-from .fields_in_time import depends_on_time, drift_field
-from .linear_maps import derivative_at, Growth, largest_growth, spread_evenly
+from .fields_in_time import depends_on_time, drift_field, spread_evenly
+from .linear_maps import derivative_at, Growth, largest_growth
 
 
 # A step that enlarges a small change of the state by more than this, and turns it around,

@@ -64,8 +64,8 @@ class PicardNewton(
     above. If the corrections do not shrink, it solves a fraction of the time step, with the
     increments scaled alike, and continues from there part by part (continuation). If the
     branch of solutions from the start of the step ends before the full step, the step
-    fails. A small correction does not count as convergence
-    if its linear system was not solved, or if the residual is larger than the state.
+    fails. A small correction does not count as convergence if its linear system was not
+    solved, or if the residual is larger than the state.
 
     **Arguments:**
 

@@ -230,10 +230,10 @@ def _computes_halves_together(step: Step, y0: Y) -> bool:
     if not _is_pair(y0):
         return False
 
-    def change(y: Y) -> Y:
+    def whole_change(y: Y) -> Y:
         return tree_sum([change(step.t0, y) for change in step.changes.values()])
 
-    program = jax.make_jaxpr(change)(y0).jaxpr
+    program = jax.make_jaxpr(whole_change)(y0).jaxpr
     num_p = len(jtu.tree_leaves(y0[0]))
     is_in_p = [number < num_p for number in range(len(program.outvars))]
 
