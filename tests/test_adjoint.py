@@ -53,6 +53,7 @@ def _system_of(solver) -> str:
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
+@pytest.mark.slow
 def test_solvers_taken_for_their_own_inverse_undo_their_steps(system):
     y0, args = random_problem(jr.key(0), 2, 2)
     W, A = jnp.array([0.3, -0.2]), jnp.array([[0, 0.05], [-0.05, 0]])

@@ -72,6 +72,7 @@ def test_weak_errors_have_the_standard_errors_of_both_means():
     assert bar == pytest.approx(np.hypot(np.std([1, 2, 3]) / np.sqrt(3), 0.5 / 2))
 
 
+@pytest.mark.slow
 def test_weak_error_is_within_its_bars():
     result = ds.compare_solvers(
         _terms(), [ds.SRKw1()], 0.0, 1.0, [0.5], Y0, key=jr.key(1),

@@ -191,6 +191,7 @@ NOISE_BESIDE_A_BATH = {
 
 
 @pytest.mark.parametrize("noise", NOISE_BESIDE_A_BATH)
+@pytest.mark.slow
 def test_beside_other_noise_strong_friction_in_the_drift_keeps_the_temperature(noise):
     H0 = lambda t, p, q, args: (p**2 + q**2) / 2
     y0 = jnp.array(0.0), jnp.array(0.0)

@@ -82,6 +82,7 @@ def test_rare_paths_that_carry_the_mean_are_not_lost(sampling):
     assert abs(got.mean - exact) <= 4 * got.std_error < 1e-11
 
 
+@pytest.mark.slow
 def test_a_fit_that_overflows_leaves_plain_paths():
     # A close encounter.
     H0 = lambda t, p, q, args: p @ p / 2 - 1 / jnp.sqrt(q @ q + 1e-4)

@@ -49,12 +49,18 @@ def _of_oscillator(h, t1=50, **options):
 
 
 def test_lost_phases_are_told_where_two_levels_agree_by_chance():
-    got, message = _of_oscillator(1.0)
+    got, message = _of_oscillator(1.0, sampling=ds.IndependentPaths(8192))
     assert abs(got.mean - _exact(50.0)) > 3 * got.error
     assert "with steps of 0.25, changes a mean by" in message
 
 
-@pytest.mark.parametrize("options", [{}, {"sampling": ds.IndependentPaths(8192)}])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        {"sampling": ds.IndependentPaths(8192)},
+    ],
+)
 def test_resolved_phases_are_not_told(options):
     got, message = _of_oscillator(0.1, **options)
     assert abs(got.mean - _exact(50.0)) < 3 * got.error
@@ -144,6 +150,7 @@ def test_the_trial_takes_any_start_time_and_solvers_of_diffrax():
     assert message is None
 
 
+@pytest.mark.slow
 def test_many_means_do_not_raise_a_false_alarm():
     def moments(t, y, args):
         p, q = y
@@ -193,6 +200,7 @@ MEAN_OF_ROTATION = 2.46622
 FITTED = ds.ValueFunctions(degree=2, num_paths=64)
 
 
+@pytest.mark.slow
 def test_a_rotation_that_steps_miss_is_told_where_the_bar_is_small():
     """Near a maximum of the bias two levels agree, 24 bars off. Plain paths would not show
     the change."""
@@ -229,6 +237,7 @@ def test_changes_that_noise_would_hide_are_told_apart_from_those_that_are_sure()
     assert said in _caveat(pair, hidden)
 
 
+@pytest.mark.slow
 def test_means_that_cross_by_chance_are_told_where_the_trial_is_too_noisy():
     washboard = lambda t, p, q, args: p**2 / 2 - jnp.cos(q) - 0.6 * q
     terms = ds.langevin_terms(washboard, 0.5, 0.5, ())

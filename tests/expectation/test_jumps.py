@@ -82,7 +82,10 @@ def test_a_quench_at_a_step_end_is_told_and_beyond_the_error_bar():
 
 @pytest.mark.parametrize(
     "stiffness, solver",
-    [(_quench_by_mean, ds.BAOAB()), (_quench, ds.BAOAB(ds.ImplicitMidpoint()))],
+    [
+        (_quench_by_mean, ds.BAOAB()),
+        pytest.param(_quench, ds.BAOAB(ds.ImplicitMidpoint()), marks=pytest.mark.slow),
+    ],
     ids=["mean of both sides", "forces within steps"],
 )
 def test_both_cures_give_the_right_mean_and_are_not_told(stiffness, solver):
@@ -198,7 +201,9 @@ def _within_steps(what):
     "what, solver",
     [
         ("stiffness", ds.ImplicitMidpoint()),
-        ("temperature", ds.BAOAB(ds.ImplicitMidpoint())),
+        pytest.param(
+            "temperature", ds.BAOAB(ds.ImplicitMidpoint()), marks=pytest.mark.slow
+        ),
     ],
     ids=EXACT_WITHIN,
 )
@@ -209,6 +214,7 @@ def test_a_jump_within_a_step_is_told_and_beyond_the_error_bar(what, solver):
     assert "jump within a step, such as at t=1.03." in message
 
 
+@pytest.mark.slow
 def test_steps_that_end_at_the_jump_give_the_right_mean_and_are_not_told():
     H0, T = _within_steps("temperature")
     # As many steps before the jump as fit, up to a start that is a little earlier.
@@ -291,7 +297,9 @@ def test_noise_that_jumps_at_a_step_end_is_told_for_solvers_that_take_it_there(s
 
 
 @pytest.mark.parametrize(
-    "solver", [ds.ImplicitMidpoint(), ds.StormerVerlet()], ids=repr
+    "solver",
+    [pytest.param(ds.ImplicitMidpoint(), marks=pytest.mark.slow), ds.StormerVerlet()],
+    ids=repr,
 )
 def test_solvers_that_take_noise_within_steps_are_right_where_it_jumps(solver):
     got, message = _estimate(None, solver, 0.25, terms=WITH_JUMPING_NOISE)

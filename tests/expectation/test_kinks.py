@@ -103,6 +103,7 @@ def test_a_weak_method_has_no_gaussian_path():
     assert "Gaussian" not in estimate.reason
 
 
+@pytest.mark.slow
 def test_a_trial_with_gaussian_increments_is_made_at_long_steps_too():
     # Truncated increments of which nothing is left would not do.
     spring = lambda t, p, q, args: 0.1 * q**2 / 2

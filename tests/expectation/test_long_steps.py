@@ -401,6 +401,7 @@ def test_decay_of_a_fast_mode_is_told_in_every_unit_of_time(scale):
     assert _is_told_of_decay(*_call(BATH, ds.ImplicitMidpoint(), scale))
 
 
+@pytest.mark.slow
 def test_friction_that_a_splitting_solves_apart_is_right_and_not_told():
     given = _call(BATH, ds.BAOAB(ds.ImplicitMidpoint()))
     sampling = ds.IndependentPaths(500)

@@ -100,6 +100,7 @@ def test_sorting_is_a_permutation_by_place_with_the_failed_ones_last(x64):
     assert np.all(np.diff(good) > -1e-3)
 
 
+@pytest.mark.slow
 def test_only_the_last_set_of_points_is_kept():
     first = weakref.ref(sobol_points(64, 3))
     assert sobol_points(64, 3) is first()

@@ -10,6 +10,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from ..drjit_here import needs_drjit
+from ..families import slow_except
 from ..picard import by_picard
 
 
@@ -61,7 +62,7 @@ SAMPLINGS = [
 ]
 
 
-@pytest.mark.parametrize("sampling", SAMPLINGS)
+@pytest.mark.parametrize("sampling", slow_except(SAMPLINGS[1:2], SAMPLINGS))
 def test_means_over_drawn_starts_and_args_are_right(sampling):
     estimate = mean(sampling)
     np.testing.assert_array_less(
@@ -94,6 +95,7 @@ def test_parts_of_an_estimate_draw_the_samples_of_the_whole():
     assert first.merge(second).mean[1] == whole.mean[1]
 
 
+@pytest.mark.slow
 def test_the_default_does_not_rely_on_few_paths():
     # An explicit solver: 5.6 in place of 10 s of processor time, nearly all to compile.
     given = dict(args={"strength": 1.0}, solver=ds.StormerVerlet())

@@ -13,6 +13,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._simulation.levels import Combination, level_weights
 
 from ..drjit_here import needs_drjit
+from ..families import slow_except
 
 
 KEY = jr.key(0)
@@ -125,6 +126,7 @@ def test_what_is_printed_after_the_mean_holds_the_error_of_the_step(how):
         assert abs(got.mean - exact) < got.error < 1e-4
 
 
+@pytest.mark.slow
 def test_levels_are_added_until_the_tolerance_holds_for_the_whole_error():
     levels = []
     for tol in (1e-3, 1e-6, 1e-9):
@@ -208,7 +210,7 @@ def test_the_last_extrapolation_counts_as_one_of_the_first_power():
         )
 
 
-@pytest.mark.parametrize("h, t1", [(0.5, 50), (0.5, 20)])
+@pytest.mark.parametrize("h, t1", slow_except([(0.5, 20)], [(0.5, 50), (0.5, 20)]))
 def test_levels_that_fit_the_order_by_chance_do_not_promise_too_much(h, t1):
     # The phase of the longest steps is off by a radian, and each smaller step mends three
     # quarters of that.

@@ -187,6 +187,7 @@ def test_noise_that_enters_nonlinearly_leaves_the_mean_as_it_is():
     assert got.std_error < plain.std_error / 3
 
 
+@pytest.mark.slow
 def test_the_degree_is_chosen_for_each_number_by_fresh_paths_and_never_worse_than_plain():
     got = _estimate(ds.ValueFunctions(), phi=_jumps)
     plain = _estimate(ds.ValueFunctions(0), phi=_jumps)
@@ -371,6 +372,7 @@ def test_the_sampling_follows_from_dimension_outcomes_and_steps(
     assert type(sampling_for(problem, None)[0]) is ds.IndependentPaths
 
 
+@pytest.mark.slow
 def test_the_default_is_the_same_each_time_and_goes_on_with_itself():
     estimate = lambda **kwargs: _estimate(None, levels=None, **kwargs)
     got = estimate(tol=1e-6)
@@ -436,6 +438,7 @@ def test_bad_input_is_told_what_to_pass():
         _estimate(1000)
 
 
+@pytest.mark.slow
 def test_a_fit_whose_steps_are_too_long_for_sweeps_is_made_by_newtons_method():
     got = _estimate(ds.ValueFunctions(degree=2), KUBO, MIDPOINT, t1=16.0, dt0=8.0)
     assert got.num_failed == 0

@@ -74,6 +74,7 @@ def test_of_coordinates_to_sort_by():
     here(mean(first, GAUSSIAN, jnp.ones(8), sampling), "sorted by 8 coordinates")
 
 
+@pytest.mark.slow
 def test_of_a_fit_that_takes_long(monkeypatch):
     monkeypatch.setattr(basis_choice, "_MOST_WITHOUT_WARNING", 1)
     sampling = ds.ValueFunctions(2, 64)

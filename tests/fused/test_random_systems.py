@@ -10,18 +10,17 @@ import pytest
 
 from ..drjit_here import needs_drjit
 from ..families import slow_except
-from .fuzz import cases, IN_COMPANY_QUICK, of_control_flow
+from .fuzz import cases, of_control_flow
 
 
 pytestmark = needs_drjit
 
 # A process takes seconds to start, so several systems share one.
 FIRST = len(of_control_flow())
-COMPANY = FIRST + IN_COMPANY_QUICK
-QUICK = [range(0, 3), range(FIRST, FIRST + 25), range(FIRST + 25, COMPANY)]
+QUICK = [range(0, 3), range(FIRST, FIRST + 15)]
 LONG = [
     range(begin, min(begin + 12, end))
-    for start, end in ((3, FIRST), (COMPANY, len(cases())))
+    for start, end in ((3, FIRST), (FIRST + 15, len(cases())))
     for begin in range(start, end, 12)
 ]
 # A table is returned by a branch, for a checkpoint in the other one. JAX 0.12 makes another

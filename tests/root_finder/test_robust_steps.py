@@ -130,6 +130,7 @@ def _end(strength, q0, adjoint=REVERSE):
     return jnp.where(success, ys[1][-1], 0.0), success
 
 
+@pytest.mark.slow
 def test_gradients_survive_a_path_that_fails():
     q0 = jnp.array([0.1, 50.0, 0.2])
     ends = lambda s, **kwargs: jax.vmap(lambda q: _end(s, q, **kwargs))(q0)

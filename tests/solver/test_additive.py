@@ -58,6 +58,7 @@ def _strong_errors(terms, solver, y0, args, fine=2**9):
     return np.sqrt(np.mean(squares, axis=1))
 
 
+@pytest.mark.slow
 def test_the_default_sign_has_the_smaller_strong_error():
     # Over 200 common paths; on other systems the two come closer to each other.
     y0, args = _problem(jr.key(8), 1, 2)

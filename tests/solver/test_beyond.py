@@ -142,6 +142,7 @@ class _OnePlateau(ds.AbstractSymplecticRungeKutta):
         return 2
 
 
+@pytest.mark.slow
 def test_one_plateau_is_only_order_one_there():
     steps, errors = _strong_errors(_OnePlateau(), 6.0)
     assert slope(steps, errors) <= 1.25

@@ -13,6 +13,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from ..drjit_here import needs_drjit
+from ..families import slow_except
 from ..problems import as_friction, Given
 
 
@@ -84,6 +85,7 @@ def _harmonic(slow):
 
 
 @pytest.mark.parametrize("h", [0.1, 1.0, 7.0])
+@pytest.mark.slow
 def test_the_flow_of_the_whole_energy_keeps_the_law_of_a_harmonic_system_exactly(h):
     # omega h up to 70, friction gamma h up to 6.
     terms, K, masses, flow = _harmonic(None)
@@ -205,7 +207,7 @@ def test_a_fused_kernel_takes_the_same_paths(name):
         np.testing.assert_allclose(x, y, rtol=1e-11, atol=1e-12)
 
 
-@each_flow
+@pytest.mark.parametrize("name", slow_except(["Verlet"], FLOWS))
 def test_gradients_are_those_of_differences_and_of_the_way_back(name):
     path = ds.FixedStepBrownianPath((N,), KEY)
 
@@ -250,6 +252,7 @@ def _mean_in_time(terms, solver, y0, phi, h, t1, args=None, num_paths=2000):
 
 
 @pytest.mark.parametrize("gamma", [1.0, 5.0, 50.0])
+@pytest.mark.slow
 def test_masses_that_depend_on_positions_keep_their_law_at_every_friction(gamma):
     # With the mass exp(2 q1): <q1> = 1 and <p0^2 exp(-2 q1)> = 1. (The midpoint rule on
     # the whole of the equation has <q1> = 0.88, 0.66 and 0.17.)
@@ -316,7 +319,11 @@ RODS = _Masses(
 )
 
 
-@pytest.mark.parametrize("masses", [PISTON, RODS], ids=["piston", "rods"])
+@pytest.mark.parametrize(
+    "masses",
+    [pytest.param(PISTON, marks=pytest.mark.slow), RODS],
+    ids=["piston", "rods"],
+)
 def test_one_step_keeps_the_law_of_gibbs_to_second_order(masses):
     # By quadrature over the law of Gibbs and the noise, without sampling. The change of a
     # mean in a step, over h, has the order of the law that the step keeps.

@@ -100,6 +100,7 @@ def test_the_orders_of_the_wrapped_solver_bound_those_of_the_splitting():
     assert (weak_only.weak_order(terms), weak_only.strong_order(terms)) == (2, None)
 
 
+@pytest.mark.slow
 def test_noises_that_do_not_commute_leave_the_splitting_at_weak_order_two():
     # Neither with each other nor with the flow.
     def noise(t, p, q, args):

@@ -143,6 +143,7 @@ def test_without_noise_spins_come_to_rest_along_their_field():
     np.testing.assert_allclose(s1, expected, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_gradients_with_respect_to_damping_and_parameters():
     H = lambda t, s, args: -jnp.sum(args * s[..., 2]) - jnp.sum(s[1:] * s[:-1])
     s0, _ = _problem(jr.key(0), 4, 1)

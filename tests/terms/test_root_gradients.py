@@ -69,7 +69,6 @@ QUICK = [
     (ds.BAOAB(), "matrix"),
     (ds.BAOAB(), "along"),
     (ds.ImplicitMidpoint(), "wall"),
-    (ds.ImplicitMidpoint(), "heated side"),
 ]
 # Each of the others once, with the one or the other solver in turn.
 OTHERS = zip(itertools.cycle([ds.BAOAB(), ds.ImplicitMidpoint()]), CASES)

@@ -141,6 +141,7 @@ def test_of_several_traced_paths_it_is_not_known_whether_they_are_one():
     np.testing.assert_allclose(jax.jit(lambda: mean(terms))(), mean(terms), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_noisy_spring_beside_a_bath_is_as_hot_as_the_exact_moments_say():
     # 2 g <p^2> = 2 g T + s^2 <q^2> and <p^2> = <q^2>.
     estimate = ds.expectation(

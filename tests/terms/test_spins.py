@@ -233,6 +233,7 @@ def test_a_batch_of_chains_keeps_lengths_and_does_not_see_the_phase(dtype):
     np.testing.assert_allclose(again, s1, atol=256 * eps)
 
 
+@pytest.mark.slow
 def test_gradients_go_through_a_solve_from_the_poles():
     s0 = np.concatenate([POLES, EQUATOR[:2]])
     weights, direction = np.random.default_rng(1).normal(size=(2, 4, 3))

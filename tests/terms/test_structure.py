@@ -265,7 +265,6 @@ def _heated(H0, structure, noise=None):
     "make, solver, name",
     [
         (_kicked, ds.StormerVerlet(), "hamiltonian_terms"),
-        (_heated, ds.BAOAB(), "langevin_terms"),
         (_heated, ds.BAOAB(ds.StormerVerlet()), "langevin_terms"),
     ],
 )

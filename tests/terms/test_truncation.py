@@ -281,6 +281,7 @@ def test_a_bath_is_as_hot_where_phi_has_kinks():
     assert abs(estimate.mean - np.sqrt(2 / np.pi)) < 4 * estimate.std_error
 
 
+@pytest.mark.slow
 def test_long_steps_are_compared_too():
     terms = ds.langevin_terms(WELL, 0.5, 1.0, ())
     got = ds.compare_solvers(
