@@ -496,10 +496,9 @@ def _with_saved_cotangents(
 def _steps_without_inverse() -> str:
     """Steps of solvers for heat baths that shrink areas to zero, for messages: such as
     "`BAOAB` with rate of friction times step equal to 2"."""
-    # The zero of `area_factor`: its x is the rate times the step over 2 `friction_parts`.
     return " or of ".join(
         f"`{type(solver).__name__}` with rate of friction times step equal to "
-        f"{2 * solver.friction_parts}"
+        f"{solver.friction_without_inverse:g}"
         for solver in (kind() for kind in LANGEVIN)
         if solver.undoes_its_steps
     )

@@ -25,6 +25,11 @@ _STRUCTURES = {
 }
 # Shown around any solver.
 _LINEAR_FLOW = ds.LinearFlow(ds.NinomiyaVictoir(), lambda time, y, args: y)
+# Any splitting that is the same in reverse.
+_HALF_KICK, _HALF_FLIGHT = ds.Kick(1 / 2), ds.Flight(1 / 2)
+_SPLITTING = ds.Splitting(
+    [_HALF_KICK, _HALF_FLIGHT, ds.Bath(1), _HALF_FLIGHT, _HALF_KICK]
+)
 
 
 def with_tables(markdown: str) -> str:
@@ -42,7 +47,11 @@ def with_tables(markdown: str) -> str:
 def table(name: str) -> str:
     """The table of all solvers, the names of the solvers for any system, or all public
     names."""
-    solvers = [*(solver() for solver in (*SOLVERS, *LANGEVIN)), _LINEAR_FLOW]
+    solvers = [
+        *(solver() for solver in (*SOLVERS, *LANGEVIN)),
+        _SPLITTING,
+        _LINEAR_FLOW,
+    ]
     if name == "names any":
         names = [f"`{s.__name__}`" for s in SOLVERS if s().structure == "any"]
         return f"{', '.join(names[:-1])} and {names[-1]}"

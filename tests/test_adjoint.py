@@ -17,7 +17,7 @@ from diffrax_symplectic._adjoint import (
     _steps_without_inverse,
     _undoes_its_steps,
 )
-from diffrax_symplectic._solver import LANGEVIN, SOLVERS
+from diffrax_symplectic._solver import AbstractLangevinSplitting, LANGEVIN, SOLVERS
 from diffrax_symplectic._tableau import FlatTableau, is_own_inverse, Stage
 
 from .problems import (
@@ -29,6 +29,7 @@ from .problems import (
     random_problem,
     weak_path,
 )
+from .solver.test_every_solver import OBABO
 
 
 def separable_H0(t, p, q, args):
@@ -39,7 +40,11 @@ def separable_noise(t, p, q, args):
     return jnp.stack([jnp.sum(jnp.sin(q)), jnp.sum(jnp.cos(2 * q) * (1 + t))])
 
 
-REVERSIBLE = [kind() for kind in (*SOLVERS, *LANGEVIN) if kind().undoes_its_steps]
+REVERSIBLE = [
+    solver
+    for solver in (*(kind() for kind in (*SOLVERS, *LANGEVIN)), OBABO)
+    if solver.undoes_its_steps
+]
 # The functions of each system, and the solvers that take it.
 SYSTEMS = {
     "any": (H0, noise),
@@ -49,7 +54,11 @@ SYSTEMS = {
 
 
 def _system_of(solver) -> str:
-    return "with friction" if isinstance(solver, LANGEVIN) else solver.structure
+    return (
+        "with friction"
+        if isinstance(solver, AbstractLangevinSplitting)
+        else solver.structure
+    )
 
 
 @pytest.mark.parametrize("system", SYSTEMS)
@@ -71,7 +80,7 @@ def test_solvers_taken_for_their_own_inverse_undo_their_steps(system):
         def step(t0, t1, direction, y, solver=solver):
             wrapped = diffrax.MultiTerm(*[WrapTerm(x, direction) for x in terms])
             state = None
-            if isinstance(solver, LANGEVIN):
+            if isinstance(solver, AbstractLangevinSplitting):
                 state = solver.init(wrapped, t0, t1, y, args)
             return solver.step(wrapped, t0, t1, y, args, state, False)[0]
 
@@ -96,8 +105,8 @@ def test_solvers_that_the_docstring_names_undo_their_steps():
 
 def test_the_message_names_the_steps_that_shrink_areas_to_zero():
     for solver in REVERSIBLE:
-        if isinstance(solver, LANGEVIN):
-            rate_times_step = 2 * solver.friction_parts
+        if isinstance(solver, AbstractLangevinSplitting):
+            rate_times_step = solver.friction_without_inverse
             assert solver.area_factor(rate_times_step) == 0
             name = type(solver).__name__
             said = (

@@ -123,7 +123,9 @@ def jumps_at_step_ends(problem: Problem) -> str | None:
     1. Two levels extrapolate by order 2, and differ by less than the error. Looks at the
     ends of the shortest steps, so also at the middles of the longest ones."""
     solver = problem.solver
-    if isinstance(solver, AbstractLangevinSplitting) and solver.symmetric:
+    if isinstance(solver, AbstractLangevinSplitting):
+        if not solver.symmetric or not solver.kicks_at_ends:
+            return None
         return _jumping_kicks(problem, solver)
     if isinstance(solver, AbstractSymplecticRungeKutta):
         return _jumping_stages(problem, solver)
@@ -134,7 +136,7 @@ def _jumping_kicks(problem: Problem, solver: AbstractLangevinSplitting) -> str |
     """`jumps_at_step_ends` for the forces of splittings that begin and end with a kick."""
     terms, y0 = momentum_first(problem.terms, problem.y0)
     drift, _, _ = split_friction(without_constraint(terms))
-    kicks, _ = kicks_and_rest(solver.flow, drift)
+    kicks, _ = kicks_and_rest(solver.has_flow, drift)
     if not kicks:
         return None
     end = _first_jump_at_end(force_field(kicks, problem.args), problem, y0)
@@ -142,9 +144,9 @@ def _jumping_kicks(problem: Problem, solver: AbstractLangevinSplitting) -> str |
         return None
     name = type(solver).__name__
     other_cure = ""
-    if solver.flow is None:
+    if not solver.has_flow:
         other_cure = (
-            f", or pass `{name}(ImplicitMidpoint())`, which takes forces within steps"
+            ", or pass `BAOAB(ImplicitMidpoint())`, which takes forces within steps"
         )
     return (
         f"The forces jump at step ends, such as t={end:.6g}, and `{name}` takes one side "

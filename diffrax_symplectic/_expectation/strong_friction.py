@@ -87,7 +87,7 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
         return _unresolved_decay(problem, dt0, most)
     if not friction or not noise:
         return None
-    has_flow = isinstance(solver, AbstractLangevinSplitting) and solver.flow is not None
+    has_flow = isinstance(solver, AbstractLangevinSplitting) and solver.has_flow
     may_change = _depends_on_positions(problem, friction)
     if most is None and not has_flow and not may_change:
         return None

@@ -4,14 +4,15 @@ Solvers, each with its `record`:
 
 - `general`, `separable`, `additive`: those by Wang, Hong and Xu and others, as tableaus.
 - `beyond`: for noises that do not commute, or more accurate paths.
-- `langevin`: splittings for heat baths; `splitting`: `LinearFlow`, for systems without one.
+- `langevin`, `splitting`: for heat baths; `fast_flow`: `LinearFlow`, for others.
 
 What they are made of:
 
 - `base`: the base classes, and the step of a tableau; `record`: facts about a solver.
 - `driven`, `brackets`: what drives the stages of a step.
 - `step`: a step by the plan of a tableau, and its stage equations.
-- `flow`, `linear_flow`: flows within a splitting; `bath`: friction and noise there.
+- `pieces`: those of a splitting; `flow`, `linear_flow`: flows there; `bath`: friction and
+  noise.
 - `constrained`: steps of systems with a constraint.
 - `paths`: the path that a solver needs; `times`: whether times resolve a step.
 """
@@ -26,8 +27,10 @@ from .bath import after_friction
 from .beyond import StrangGauss, NinomiyaVictoir, PlateauGauss, LevyAreaMidpoint
 from .separable import SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet, PlateauVerlet
 from .additive import SRKs4, SRKw5, AdditiveGauss
-from .langevin import AbstractLangevinSplitting, BAOAB, LangevinMiddle
-from .splitting import LinearFlow
+from .langevin import BAOAB, LangevinMiddle
+from .splitting import AbstractLangevinSplitting, Splitting
+from .pieces import AbstractPiece, Bath, Flight, Flow, Kick
+from .fast_flow import LinearFlow
 from .flow import is_solver, kicks_and_rest
 from .linear_flow import linear_flow
 from .paths import common_path, own_path, path_of_array_cell
@@ -44,11 +47,12 @@ _ALL = [
     and issubclass(solver_class, AbstractSymplecticSolver)
     if solver_class.record is not None
 ]
-# Those that need friction, from `langevin_terms`.
+# Those that need friction, from `langevin_terms`, and have pieces by default.
 LANGEVIN: tuple[type[AbstractLangevinSplitting], ...] = tuple(
     solver_class
     for solver_class in _ALL
     if issubclass(solver_class, AbstractLangevinSplitting)
+    and solver_class is not Splitting
 )
 # All others that do not wrap another solver.
 SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = tuple(

@@ -175,7 +175,9 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
             if field.repr and not is_default:
                 # `tree_pformat` would ignore the `__repr__` of a module, such as this one.
                 is_module = isinstance(value, eqx.Module)
-                text = repr(value) if is_module else eqx.tree_pformat(value)
+                text = repr(value)
+                if not is_module:
+                    text = eqx.tree_pformat(value, width=1_000)
                 arguments.append(f"{field.name}={text}")
         return f"{type(self).__name__}({', '.join(arguments)})"
 

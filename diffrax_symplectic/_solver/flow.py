@@ -1,5 +1,4 @@
-"""What moves the state between the kicks and the bath of a splitting: free flight, another
-solver, or a flow that is known."""
+"""Flows within a splitting: another solver, or a flow that is known."""
 
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -16,7 +15,7 @@ from .._batch import refused_where
 from .._compat import direction
 from .._custom_types import Args, RealScalarLike, Terms, Y
 from .._root_finder import all_finite
-from .._terms import rate, slow_apart
+from .._terms import slow_apart
 from .base import AbstractSymplecticSolver
 from .step import result_of
 
@@ -59,10 +58,20 @@ def check_flow(flow: Any, steps: int, solver_name: str) -> None:
         )
 
 
-def kicks_and_rest(flow: Flow, drift: Terms) -> tuple[Terms, Terms]:
-    """The terms whose forces are the kicks, and the terms that the flow follows."""
+def check_keeps_constraint(flow: Flow) -> None:
+    """Raises a `ValueError` for a flow that leaves the surface of a constraint."""
+    if not getattr(flow, "keeps_constraints", False):
+        raise ValueError(
+            f"The flow {flow!r} does not keep the constraint of the terms. Use "
+            "`BAOAB()` or `BAOAB(StormerVerlet())`."
+        )
+
+
+def kicks_and_rest(has_flow: bool, drift: Terms) -> tuple[Terms, Terms]:
+    """The terms whose forces are the kicks of a splitting, and the terms that its flow
+    follows, or free flight."""
     # Kicks take the forces of the whole drift, and free flight its velocities.
-    if flow is None:
+    if not has_flow:
         return drift, drift
     rest, slow = slow_apart(drift)
     return slow, rest
@@ -119,17 +128,20 @@ _NAN = (
 
 
 def begin_flow(
-    flow: Flow, drift: Terms, t0: RealScalarLike, t1: Any, y0: Y, args: Args
+    flow: Flow,
+    drift: Terms,
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    time: RealScalarLike,
+    y0: Y,
+    args: Args,
 ) -> PyTree[Array]:
-    """The state of a flow at the start of a solve whose first step is from `t0` to `t1`:
-    nothing for free flight, the state of a solver, or of a function whether it returns
-    NaN."""
-    if flow is None:
-        return None
+    """The state of a flow at the start of a solve whose first step is from `t0` to `t1`,
+    with the flow over a share of it of length `time`: the state of a solver, or of a
+    function whether it returns NaN."""
     if not is_solver(flow):
         # Steps are positive even in a solve backward in time, where the flow runs back.
-        half_step = direction(drift) * (t1 - t0) / 2
-        return returns_nan(flow, half_step, y0, args)  # pyright: ignore
+        return returns_nan(flow, direction(drift) * time, y0, args)  # pyright: ignore
     return flow.init(diffrax.MultiTerm(*drift), t0, t1, y0, args)  # pyright: ignore
 
 
@@ -144,12 +156,8 @@ def after_flow(
     args: Args,
     state: PyTree[Array],
 ) -> tuple[Y, PyTree[Array], diffrax.RESULTS]:
-    """`y` after the flow from `t0` to `t1`, half a step of length `time`; the state of the
-    flow after it; and its result."""
-    if flow is None:
-        p, q = y
-        _, velocities = rate(drift, t0, y, args)
-        return (p, moved(q, time, velocities)), None, diffrax.RESULTS.successful
+    """`y` after the flow from `t0` to `t1`, a share of the step of length `time`; the state
+    of the flow after it; and its result."""
     if is_solver(flow):
         return _after_steps(flow, steps, drift, t0, t1, y, args, state)
     # Steps are positive even in a solve backward in time, where the flow runs back.

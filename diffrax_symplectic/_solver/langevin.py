@@ -1,178 +1,32 @@
-"""Langevin dynamics by splitting: kicks of the forces, drifts of the positions, and
-friction and noise between them."""
+"""Splittings for Langevin dynamics that have names of their own."""
 
 import functools as ft
-from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
+from typing import ClassVar, TYPE_CHECKING
 
-import diffrax
 import equinox as eqx
-from jaxtyping import Array, ArrayLike, PyTree
 
-from .._arguments import check_state, whole_number
-from .._compat import unwrapped
-from .._custom_types import Args, Y
+from .._arguments import whole_number
 from .._tableau import Structure
-from .._terms import (
-    apply,
-    check_structure,
-    constraint_of,
-    momentum_first,
-    rate,
-    split_friction,
-)
-from .base import AbstractSymplecticSolver
-from .bath import after_friction, check_friction
-from .constrained import baoab_step, begin_baoab
-from .driven import drawn_variables
 from .flow import (
-    after_flow,
-    begin_flow,
     check_flow,
-    check_follows,
-    Flow,
-    forces_at_start,
+    Flow as AnyFlow,
     is_solver,
-    kicks_and_rest,
-    moved,
+)
+from .pieces import (
+    AbstractPiece,
+    Bath,
+    Flight,
+    Flow,
+    Kick,
 )
 from .record import Record
-from .step import result_of
-from .times import result_with_times_checked
+from .splitting import AbstractLangevinSplitting, check_has_no_bath
 
 
 if TYPE_CHECKING:
-    from typing import ClassVar as AbstractClassVar, ClassVar as AbstractVar
+    pass
 else:
-    from equinox import AbstractClassVar, AbstractVar
-
-
-class SplittingState(NamedTuple):
-    """What a splitting hands on from the end of a step to the start of the next one.
-
-    - `forces`: those of the kicks, if a step begins and ends with half a kick.
-    - `flow`: the state of the solver that is the flow; of a function, whether it returned
-        NaN at the start.
-    """
-
-    forces: PyTree[Array]
-    flow: PyTree[Array]
-
-
-class AbstractLangevinSplitting(AbstractSymplecticSolver):
-    """A kick, half a flow, friction and noise, half a flow. A symmetric splitting makes one
-    half of the kick at the start of the step and one at its end; any other makes the whole
-    kick at the start."""
-
-    variables: ClassVar[tuple[str, ...]] = ("W",)
-    symmetric: AbstractClassVar[bool]
-    flow: AbstractVar[Flow]
-    # The steps of a solver over half a flow.
-    steps: AbstractVar[int]
-
-    @property
-    def friction_parts(self) -> int:
-        """How many parts of a step are friction and noise, each over an equal share of
-        it."""
-        return 1
-
-    def area_factor(self, rate_times_step: ArrayLike) -> Any:
-        """The factor by which a step shrinks areas, where friction is one rate for all
-        momenta. At zero a step has no inverse."""
-        # Each part is the midpoint rule for friction over its share of the step.
-        x = rate_times_step / (2 * self.friction_parts)
-        return ((1 - x) / (1 + x)) ** self.friction_parts
-
-    def stage_vectors(self, num_noises):
-        if not is_solver(self.flow):
-            return ()
-        # The steps of the flow before and after the bath, one after another.
-        return 2 * self.steps * self.flow.stage_vectors(num_noises)  # pyright: ignore
-
-    @property
-    def undoes_its_steps(self) -> bool:
-        if not self.symmetric:
-            return False
-        return not is_solver(self.flow) or self.flow.undoes_its_steps  # pyright: ignore
-
-    def order(self, terms):
-        return 2 if self.symmetric else 1
-
-    def check(self, terms, t0, y0: Y, args: Args) -> None:
-        solver_name = type(self).__name__
-        check_state(solver_name, y0)
-        terms, y0 = momentum_first(terms, y0)
-        drift, friction, noise = split_friction(terms)
-        kicks, rest = kicks_and_rest(self.flow, drift)
-        check_structure("separable", kicks, noise, t0, y0, args, solver_name)
-        if not all(isinstance(unwrapped(term), diffrax.ODETerm) for term in drift):
-            raise ValueError(
-                f"`{solver_name}` needs a drift driven by time: pass `langevin_terms(H0, "
-                "friction, temperature, path)`."
-            )
-        check_friction(drift, friction, t0, y0, args, solver_name)
-        check_follows(self.flow, rest, t0, y0, args)
-
-    def init(self, terms, t0, t1, y0, args) -> Any:
-        self.check(terms, t0, y0, args)
-        terms, y0 = momentum_first(terms, y0)
-        drift, _, _ = split_friction(terms)
-        kicks, rest = kicks_and_rest(self.flow, drift)
-        forces = None
-        if self.symmetric and kicks:
-            forces, _ = rate(kicks, t0, y0, args)
-        return SplittingState(forces, begin_flow(self.flow, rest, t0, t1, y0, args))
-
-    def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
-        # The user's own terms and state: those of Diffrax have the state (x, v).
-        own_terms = terms
-        own_y0 = y0
-        terms, y0 = momentum_first(own_terms, own_y0)
-        drift, friction, noise = split_friction(terms)
-        kicks, rest = kicks_and_rest(self.flow, drift)
-        forces, flow_state = solver_state
-        p, q = y0
-        h = t1 - t0
-        half = h / 2
-        middle = t0 + half
-
-        def compute_forces() -> PyTree[Array]:
-            forces, _ = rate(kicks, t0, y0, args)
-            return forces
-
-        # Kick
-        if self.symmetric and kicks:
-            forces = forces_at_start(forces, made_jump, compute_forces)
-            p = moved(p, half, forces)
-        elif kicks:
-            p = moved(p, h, compute_forces())
-        # Flow. Of the rates at (p, q) only the velocities are used; XLA drops the forces.
-        follow = ft.partial(after_flow, self.flow, self.steps, rest)
-        (p, q), flow_state, _ = follow(t0, middle, half, (p, q), args, flow_state)
-        # Friction and noise
-        noise_change = None
-        if len(noise) > 0:
-            variables = drawn_variables(noise, ["W"], t0, t1, type(self).__name__)
-            noise_change, _ = apply(noise, variables["W"], args, middle, (p, q))
-        p = after_friction(friction, middle, h, (p, q), args, noise_change)
-        # Flow. Velocities of free flight do not depend on time. Taken at `t1`, the time of
-        # the forces below, they share with these what depends on time alone.
-        start = t1 if self.flow is None else middle
-        (p, q), flow_state, flow_result = follow(
-            start, t1, half, (p, q), args, flow_state
-        )
-        # Kick
-        if self.symmetric and kicks:
-            forces, _ = rate(kicks, t1, (p, q), args)
-            p = moved(p, half, forces)
-        R: Any = diffrax.RESULTS
-        result = result_of(None, (p, q))
-        if self.flow is not None:
-            result = R.where(flow_result == R.successful, result, flow_result)
-        result = result_with_times_checked(terms, t0, t1, result)
-        # If the state is Diffrax's (x, v), its halves are exchanged once more.
-        _, y1 = momentum_first(own_terms, (p, q))
-        state = SplittingState(forces, flow_state)
-        return y1, None, dict(y0=own_y0, y1=y1), state, result
+    pass
 
 
 _FREE_FLIGHT = Record(
@@ -269,21 +123,25 @@ class BAOAB(AbstractLangevinSplitting):
     the ends of long steps are better.
     """
 
-    flow: Flow = None
+    flow: AnyFlow = None
     steps: int = eqx.field(
         default=1, static=True, converter=ft.partial(whole_number, "steps")
     )
 
-    symmetric: ClassVar[bool] = True
     keeps_constraints: ClassVar[bool] = True
 
     def __check_init__(self):
         check_flow(self.flow, self.steps, type(self).__name__)
-        if issubclass(type(self.flow), AbstractLangevinSplitting):
-            raise ValueError(
-                f"`{type(self.flow).__name__}` has a bath of its own. Pass a solver for "
-                "systems without noise as `flow`, such as `StormerVerlet()`."
-            )
+        check_has_no_bath(self.flow)
+
+    @property
+    def pieces(self) -> tuple[AbstractPiece, ...]:  # pyright: ignore
+        kick = Kick(1 / 2)
+        if self.flow is None:
+            move = Flight(1 / 2)
+        else:
+            move = Flow(1 / 2, self.flow, self.steps)
+        return (kick, move, Bath(1), move, kick)
 
     @property
     def record(self) -> Record:  # pyright: ignore
@@ -297,29 +155,6 @@ class BAOAB(AbstractLangevinSplitting):
     @property
     def structure(self) -> Structure:
         return self.flow.structure if is_solver(self.flow) else "separable"  # pyright: ignore
-
-    def init(self, terms, t0, t1, y0, args) -> Any:
-        if constraint_of(terms) is None:
-            return super().init(terms, t0, t1, y0, args)
-        return begin_baoab(self, self.flow, terms, t0, t1, y0, args)
-
-    def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
-        if constraint_of(terms) is None:
-            return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
-        y1, state = baoab_step(
-            self.flow,
-            self.steps,
-            terms,
-            t0,
-            t1,
-            y0,
-            args,
-            solver_state,
-            made_jump,
-            type(self).__name__,
-        )
-        result = result_with_times_checked(terms, t0, t1, result_of(state.outcome, y1))
-        return y1, None, dict(y0=y0, y1=y1), state, result
 
 
 class LangevinMiddle(AbstractLangevinSplitting):
@@ -359,10 +194,13 @@ class LangevinMiddle(AbstractLangevinSplitting):
     (2019)](https://doi.org/10.1021/acs.jpca.9b02771) for the splitting.
     """
 
-    symmetric: ClassVar[bool] = False
     structure: ClassVar[Structure] = "separable"
-    flow: ClassVar[None] = None
-    steps: ClassVar[int] = 1
+    pieces: ClassVar[tuple[AbstractPiece, ...]] = (
+        Kick(1),
+        Flight(1 / 2),
+        Bath(1),
+        Flight(1 / 2),
+    )
     record: ClassVar[Record] = Record(
         weak=1,
         strong=1,

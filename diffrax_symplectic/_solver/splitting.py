@@ -1,228 +1,392 @@
-"""The flow of a fast linear part around the step of another solver."""
+"""Splittings for Langevin dynamics: a step that carries out one piece after another."""
 
-from typing import Any, ClassVar, NamedTuple
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
 import diffrax
+import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, PyTree
+import jax.tree_util as jtu
+import optimistix as optx
+from jaxtyping import Array, ArrayLike, PyTree
 
-from .._arguments import check_pair, check_takes
-from .._compat import direction
-from .._custom_types import RealScalarLike, Y
+from .._arguments import check_state
+from .._compat import unwrapped, wrapped_like
+from .._custom_types import Args, Terms, Y
 from .._tableau import Structure
 from .._terms import (
-    check_unconstrained,
-    Dependence,
+    check_structure,
+    constraint_of,
     momentum_first,
-    slow_apart,
+    rate,
     split_friction,
+    Surface,
+    with_constraint,
+    without_constraint,
 )
 from .base import AbstractSymplecticSolver
-from .flow import check_returns_pair, FlowFunction, returns_nan
-from .langevin import AbstractLangevinSplitting
-from .record import Order, Record
-
-
-class LinearFlowState(NamedTuple):
-    """What a `LinearFlow` hands on from the end of a step to the start of the next one.
-
-    - `solver`: the state of the solver for the rest.
-    - `is_broken`: whether the flow returned NaN at the start of the solve.
-    """
-
-    solver: PyTree[Array]
-    is_broken: Bool[Array, ""]
-
-
-# What to use in a heat bath, for every refusal.
-_BATH = (
-    "In a heat bath use `BAOAB(linear_flow(...))`, or `BAOAB(flow)` with a function of "
-    "your own, for `langevin_terms(H0, friction, temperature, path, slow=rest)` of the "
-    "whole energy: friction acts between two halves of the flow."
+from .bath import check_friction
+from .constrained import end_and_outcome, init_constrained
+from .driven import drawn_variables
+from .flow import (
+    begin_flow,
+    check_follows,
+    check_keeps_constraint,
+    Flow as AnyFlow,
+    forces_at_start,
+    is_solver,
+    kicks_and_rest,
 )
+from .pieces import (
+    AbstractPiece,
+    Bath,
+    first_alike,
+    Flight,
+    Flow,
+    is_known_at_ends,
+    Kick,
+    lengths_and_times,
+    Moving,
+    Setting,
+)
+from .record import Record
+from .step import result_of
+from .times import result_with_times_checked
 
 
-class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
-    r"""Any solver of this package for $H_0 = L + R$ without a heat bath, with the exact
-    flow of $L$ around a step for the rest $R$.
+if TYPE_CHECKING:
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
-    $$y \gets \varphi_L(\tfrac h2)\, y, \qquad y \gets \text{a step of the solver for } R
-      \text{ and the noises}, \qquad y \gets \varphi_L(\tfrac h2)\, y$$
 
-    Use it for systems whose fast parts are linear, $L = \frac12 y \cdot A y$, such as waves
-    on a lattice or the bonds of a molecule. Their frequencies then do not limit the step.
-    The error is proportional to commutators of $L$ with the rest.
+class SplittingState(NamedTuple):
+    """What a splitting hands on from the end of a step to the start of the next one.
 
-    The terms contain $R$ and all noises, without $L$: energy must not be
-    in both. If they depend on $q$ alone, `LinearFlow(StormerVerlet(), flow)` is
-    explicit. If $R$ depends on $p$ and $q$ together, as for complex amplitudes, take a
-    solver for general systems.
-
-    Terms with friction are refused. They are for [`diffrax_symplectic.BAOAB`][], which
-    takes the same `flow` or a [`diffrax_symplectic.linear_flow`][], and $R$ as `slow=` of
-    [`diffrax_symplectic.langevin_terms`][].
-
-    The method is symplectic if the solver and `flow` are, which
-    [`diffrax_symplectic.symplecticity_defect`][] tests. The orders are the solver's, but at
-    most weak order 2, strong order 1, and order 2 without noise.
-
-    !!! warning
-
-        If $\omega h$ is close to a multiple of $\pi$ for a mode of frequency $\omega$, the
-        splitting is in resonance and the rest makes this mode grow. The width of the
-        resonance is proportional to the rest. To detect it, compare with half the step. A
-        [`diffrax_symplectic.linear_flow`][] has no resonances.
-
-    **Source:** the splitting of [Strang (1968)](https://doi.org/10.1137/0705041); impulse
-    methods of [Grubmüller, Heller, Windemuth and Schulten
-    (1991)](https://doi.org/10.1080/08927029108022142).
+    - `forces`: those of the kicks, if a step begins and ends with them.
+    - `flows`: for each piece the state of its flow: of a solver its state, of a function
+        whether it returned NaN at the start.
+    - `outcome`: with a constraint, whether its multipliers were found in all steps so far.
     """
 
-    solver: AbstractSymplecticSolver
-    flow: FlowFunction
+    forces: PyTree[Array]
+    flows: list[PyTree[Array]]
+    outcome: optx.RESULTS | None
 
-    # When to choose it, in a sentence.
-    choose: ClassVar[str] = (
-        "Solves the fast linear waves of lattices and molecules exactly, without a bath."
-    )
-    # The highest orders of the splitting.
-    weak: ClassVar[int] = 2
-    strong: ClassVar[int] = 1
 
-    def __check_init__(self):
-        # `isinstance` would look through wrappers, such as `diffrax.HalfSolver`.
-        inner = type(self.solver)
-        if not issubclass(inner, AbstractSymplecticSolver):
-            raise ValueError(
-                "`LinearFlow` wraps a solver of this package, such as `StormerVerlet()`; "
-                f"got `{inner.__name__}`."
-            )
-        if issubclass(inner, AbstractLangevinSplitting):
-            raise ValueError(f"`LinearFlow` takes no `{inner.__name__}`. {_BATH}")
-        check_takes("flow", self.flow, "time", "y", "args")
+class AbstractLangevinSplitting(AbstractSymplecticSolver):
+    """A solver for Langevin dynamics that carries out one piece after another."""
 
-    @property
-    def record(self) -> Record | None:  # pyright: ignore
-        record = self.solver.record
-        if record is None:
-            return None
-        # With a flow around it, stationary moments that are exact for the solver alone need
-        # not be.
-        return record._replace(
-            weak=_at_most(record.weak, self.weak),
-            strong=_at_most(record.strong, self.strong),
-            stationary=(),
-        )
+    pieces: AbstractVar[tuple[AbstractPiece, ...]]
 
-    def weak_order(self, terms) -> int | None:
-        order = self.solver.weak_order(terms)
-        return None if order is None else min(order, self.weak)
-
-    def strong_order(self, terms) -> int | float | None:
-        order: Any = self.solver.strong_order(terms)
-        return None if order is None else min(order, self.strong)
-
-    @property
-    def structure(self) -> Structure:
-        return self.solver.structure
+    def _first_alike(self) -> tuple[int, ...]:
+        """For each piece the position of the first one that is alike."""
+        return first_alike(self.pieces)
 
     @property
     def variables(self) -> tuple[str, ...]:
-        return self.solver.variables
+        # With `H` the increment of a step is shared between two baths.
+        return ("W", "H") if len(self._baths) == 2 else ("W",)
 
     @property
-    def root_finder(self):
-        return self.solver.root_finder  # pyright: ignore
+    def symmetric(self) -> bool:
+        """Whether the pieces are the same in reverse."""
+        positions = self._first_alike()
+        return positions == positions[::-1]
 
     @property
-    def root_find_max_steps(self) -> int:
-        return self.solver.root_find_max_steps  # pyright: ignore
+    def has_flow(self) -> bool:
+        """Whether there is a flow other than free flight."""
+        return any(isinstance(piece, Flow) for piece in self.pieces)
+
+    @property
+    def kicks_at_ends(self) -> bool:
+        """Whether a step kicks before positions move and after they did, so that it needs
+        forces at its end only."""
+        return is_known_at_ends(self.pieces)
+
+    @property
+    def _baths(self) -> list[Bath]:
+        return [piece for piece in self.pieces if isinstance(piece, Bath)]
+
+    @property
+    def _flows(self) -> dict[int, Flow]:
+        """The flows, each once, by their positions."""
+        flows = {}
+        for position, piece in enumerate(self.pieces):
+            is_first = self._first_alike()[position] == position
+            if isinstance(piece, Flow) and is_first:
+                flows[position] = piece
+        return flows
+
+    def area_factor(self, rate_times_step: ArrayLike) -> Any:
+        """The factor by which a step shrinks areas, where friction is one rate for all
+        momenta. At zero a step has no inverse."""
+        factor = 1.0
+        for bath in self._baths:
+            # Each bath is the midpoint rule for friction over its share of the step.
+            x = bath.share * rate_times_step / 2
+            factor = factor * (1 - x) / (1 + x)
+        return factor
+
+    @property
+    def friction_without_inverse(self) -> float:
+        """The smallest rate of friction times step for which `area_factor` is zero."""
+        return 2 / max(bath.share for bath in self._baths)
+
+    def stage_vectors(self, num_noises):
+        vectors = ()
+        for piece in self.pieces:
+            if isinstance(piece, Flow):
+                vectors += piece.stage_vectors(num_noises)
+        return vectors
 
     @property
     def undoes_its_steps(self) -> bool:
-        return self.solver.undoes_its_steps
-
-    def stage_vectors(self, num_noises):
-        return self.solver.stage_vectors(num_noises)
+        solvers: list[Any] = [x.flow for x in self._flows.values() if is_solver(x.flow)]
+        return self.symmetric and all(solver.undoes_its_steps for solver in solvers)
 
     def order(self, terms):
-        order = self.solver.order(terms)
-        # Strang's splitting has order 2.
-        return None if order is None else min(order, 2)
+        return 2 if self.symmetric else 1
 
-    def check(self, terms, t0, y0, args):
-        check_pair(y0)
-        # Diffrax's own Langevin terms have friction, too.
-        terms, _ = momentum_first(terms, y0)
-        drift, friction, _ = split_friction(terms)
-        if len(friction) > 0:
-            raise ValueError(f"`LinearFlow` takes no terms with friction. {_BATH}")
-        _, slow = slow_apart(drift)
-        if len(slow) > 0:
+    def check(self, terms, t0, y0: Y, args: Args) -> None:
+        solver_name = type(self).__name__
+        check_state(solver_name, y0)
+        terms, y0 = momentum_first(terms, y0)
+        drift, friction, noise = split_friction(terms)
+        kicks, rest = kicks_and_rest(self.has_flow, drift)
+        check_structure("separable", kicks, noise, t0, y0, args, solver_name)
+        if not all(isinstance(unwrapped(term), diffrax.ODETerm) for term in drift):
             raise ValueError(
-                "The terms of `LinearFlow` contain the rest alone, without the energy that "
-                "`flow` stands for: pass `hamiltonian_terms(rest)`, without `slow=`. "
-                f"{_BATH}"
+                f"`{solver_name}` needs a drift driven by time: pass `langevin_terms(H0, "
+                "friction, temperature, path)`."
             )
-        check_returns_pair(self.flow, t0, y0, args)
-        t0 = jnp.asarray(t0, jnp.result_type(t0, jnp.float32))
-
-        def after_flow(time: RealScalarLike, y: Y) -> Y:
-            return self.flow(time, y, args)
-
-        # `t0` stands for any duration: dependence is decided without values.
-        dependence = Dependence(after_flow, t0, y0)
-        if dependence.independent(lambda time, y: time):
-            raise ValueError(
-                "`flow(time, y, args)` of `LinearFlow` does not depend on `time`, so it is "
-                "not a flow: for `time = 0` it must return `y`. It is called with half of "
-                "each step."
-            )
+        check_friction(drift, friction, t0, y0, args, solver_name)
+        for piece in self._flows.values():
+            check_follows(piece.flow, rest, t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args) -> Any:
-        check_unconstrained(terms, type(self).__name__)
-        self.check(terms, t0, y0, args)
-        inner_state = self.solver.init(terms, t0, t1, y0, args)
-        half = direction(terms) * (t1 - t0) / 2
-        is_broken = returns_nan(self.flow, half, y0, args)
-        return LinearFlowState(inner_state, is_broken)
+        outcome = None
+        if constraint_of(terms) is not None and self.keeps_constraints:
+            for piece in self._flows.values():
+                check_keeps_constraint(piece.flow)
+            outcome = init_constrained(self, terms, t0, y0, args)
+        else:
+            self.check(terms, t0, y0, args)
+        terms, y0 = momentum_first(terms, y0)
+        setting = self._setting(terms, t0, t1, y0, args, increments=[])
+        forces = None
+        if self.kicks_at_ends and setting.kicks:
+            forces, _ = rate(setting.kicks, t0, y0, args)
+        flows: list[PyTree] = [None for _ in self.pieces]
+        for position, piece in self._flows.items():
+            length = setting.lengths[piece.share]
+            flows[position] = begin_flow(
+                piece.flow, setting.rest, t0, t1, length, y0, args
+            )
+        return SplittingState(forces, flows, outcome)
+
+    def _setting(self, terms, t0, t1, y0, args, increments) -> Setting:
+        """What the pieces of a step from `y0` have in common, for terms with the momentum
+        first."""
+        drift, friction, noise = split_friction(without_constraint(terms))
+        kicks, rest = kicks_and_rest(self.has_flow, drift)
+        constraint = constraint_of(terms)
+        lengths, times = lengths_and_times(self.pieces, t0, t1)
+        setting = Setting(
+            kicks, rest, friction, noise, increments, args, lengths, times
+        )
+        if constraint is None:
+            return setting
+        # Solvers find the constraint at the first of the terms that they follow.
+        first, *others = rest
+        first = wrapped_like(first, with_constraint(unwrapped(first), constraint))
+        surface = Surface.of(terms, t0, y0, args)
+        return setting._replace(rest=(first, *others), surface=surface)
+
+    def _increments(self, noise: Terms, t0, t1) -> list[list]:
+        """For each bath the increments of its share of the step, one for each noise."""
+        if len(noise) == 0:
+            return []
+        names = list(self.variables)
+        variables = drawn_variables(noise, names, t0, t1, type(self).__name__)
+        if names == ["W"]:
+            return [variables["W"]]
+        # H is independent of W, with a variance of h / 12. So these are independent, with
+        # the variances of their shares, and their sum is W.
+        share, _ = [bath.share for bath in self._baths]
+        weight = math.sqrt(12 * share * (1 - share))
+
+        def first_part(W: Array, H: Array) -> Array:
+            return share * W + weight * H
+
+        first = [
+            jtu.tree_map(first_part, W, H)
+            for W, H in zip(variables["W"], variables["H"])
+        ]
+        second = [
+            jtu.tree_map(jnp.subtract, W, part)
+            for W, part in zip(variables["W"], first)
+        ]
+        return [first, second]
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
-        inner_state, is_broken = solver_state
-        # Steps are positive even in a solve backward in time, where the flow runs back.
-        half = direction(terms) * (t1 - t0) / 2
-        y = self.flow(half, y0, args)
-        # The flow is a jump for a solver that remembers the end of its last step.
-        made_jump = True
-        y, error, _, inner_state, result = self.solver.step(
-            terms, t0, t1, y, args, inner_state, made_jump
-        )
-        y1 = self.flow(half, y, args)
+        # The user's own terms and state: those of Diffrax have the state (x, v).
+        own_terms = terms
+        own_y0 = y0
+        terms, y0 = momentum_first(own_terms, own_y0)
+        _, _, noise = split_friction(without_constraint(terms))
+        increments = self._increments(noise, t0, t1)
+        setting = self._setting(terms, t0, t1, y0, args, increments)
+        forces, flow_states, outcome = solver_state
+        flow_states = list(flow_states)
+        if setting.surface is not None:
+            setting = setting._replace(pending=outcome == optx.RESULTS.successful)
+
+        def compute_forces() -> PyTree[Array]:
+            forces, _ = rate(setting.kicks, t0, y0, args)
+            return forces
+
+        if forces is not None:
+            forces = forces_at_start(forces, made_jump, compute_forces)
+        moving = Moving(y0, forces)
+        flow_results = {}
+        for position, piece in zip(self._first_alike(), self.pieces):
+            moving, flow_state, result = piece.move(
+                setting, moving, flow_states[position]
+            )
+            flow_states[position] = flow_state
+            # The last result tells of all, since the state of a flow keeps a failure.
+            if result is not None:
+                flow_results[position] = result
         R: Any = diffrax.RESULTS
-        result = R.where(is_broken, R.nonfinite, result)
-        state = LinearFlowState(inner_state, is_broken)
-        return y1, error, dict(y0=y0, y1=y1), state, result
+        if setting.surface is None:
+            result = result_of(None, moving.y)
+            for flow_result in flow_results.values():
+                result = R.where(flow_result == R.successful, result, flow_result)
+            y1 = moving.y
+        else:
+            moving = moving.made_tangent(setting.surface)
+            y1, outcome = end_and_outcome(moving.y, moving.found, outcome)
+            result = result_of(outcome, y1)
+        result = result_with_times_checked(terms, t0, t1, result)
+        # If the state is Diffrax's (x, v), its halves are exchanged once more.
+        _, y1 = momentum_first(own_terms, y1)
+        forces = moving.forces if self.kicks_at_ends else None
+        state = SplittingState(forces, flow_states, outcome)
+        return y1, None, dict(y0=own_y0, y1=y1), state, result
 
 
-def _at_most(order: Order | None, most: int) -> Order | None:
-    """The `order` of a solver, or a pair of orders for two kinds of noises, bounded by the
-    order `most` of the splitting around it."""
-    if isinstance(order, tuple):
-        commuting, others = order
-        return min(commuting, most), min(others, most)
-    return None if order is None else min(order, most)
+def check_has_no_bath(flow: AnyFlow) -> None:
+    """Raises a `ValueError` for a flow with friction and noise of its own."""
+    if issubclass(type(flow), AbstractLangevinSplitting):
+        raise ValueError(
+            f"`{type(flow).__name__}` has a bath of its own. Pass a solver for systems "
+            "without noise as `flow`, such as `StormerVerlet()`."
+        )
 
 
-LinearFlow.__init__.__doc__ = """**Arguments:**
+class Splitting(AbstractLangevinSplitting):
+    r"""Langevin dynamics by a splitting of your own.
 
-- `solver`: a solver of this package for systems without a heat bath.
-- `flow`: `flow(time, y, args)`, the exact flow of $L$: the state after `time` (which may be
-    negative) from `y = (p, q)`. Any function or Module, for example by Fourier transforms
-    for a lattice, or by eigenvectors for a molecule; or a
-    [`diffrax_symplectic.linear_flow`][].
+    !!! example
 
-**Raises:** a `ValueError` if `flow` is not such a function, for a solver of another package
-    or of Langevin dynamics, and while the solve is traced for terms with friction or
-    `slow=`, and if `flow` returns another structure or shape, or does not depend on `time`.
-    An error when run if `flow` returns NaN at the start; in a batch its path fails alone.
-"""
+        OBABO, with friction and noise at both ends of a step:
+
+        ```python
+        from diffrax_symplectic import Bath, Flight, Kick, Splitting
+
+        half_bath, half_kick = Bath(1 / 2), Kick(1 / 2)
+        obabo = Splitting([half_bath, half_kick, Flight(1), half_kick, half_bath])
+        ```
+
+    A step carries out one piece after another. Each [`diffrax_symplectic.Kick`][],
+    [`diffrax_symplectic.Flight`][] or [`diffrax_symplectic.Bath`][] takes its share of the
+    step; in place of free flight there may be a [`diffrax_symplectic.Flow`][]. Takes the
+    same terms and states as [`diffrax_symplectic.BAOAB`][], also with constraints.
+
+    All else follows from the pieces. Pieces that are the same in reverse have weak order 2,
+    and order 2 without noise; all others order 1; the strong order is 1. A kick at the end
+    of a step shares its forces with one at the start of the next step. Of two baths each
+    gets independent noise for its share of the step, from the increment $W$ and the
+    space-time Lévy area $H$ of the step: for the shares $s$ and $1 - s$ these are
+    $s W + \sqrt{12 s (1 - s)}\, H$ and the rest of $W$. So with two baths the path needs
+    $H$, as made by `solver.path(shape, key)`.
+
+    Which stationary moments are exact depends on the order: in a harmonic well, the
+    momenta of OBABO, and the positions of BAOAB and ABOBA.
+
+    **Source:** [Leimkuhler and Matthews (2013)](https://doi.org/10.1093/amrx/abs010);
+    OBABO is the scheme of [Bussi and Parrinello
+    (2007)](https://doi.org/10.1103/PhysRevE.75.056707).
+
+    **Arguments:**
+
+    - `pieces`: the pieces, in the order in which they act. The shares of the kicks add up
+        to one, as do the shares of the flights or flows, and of one or two baths.
+
+    **Raises:** a `ValueError` for other pieces.
+    """
+
+    pieces: tuple[AbstractPiece, ...]
+    # Found when made: a compiled program would not know which flows are the same.
+    positions: tuple[int, ...] = eqx.field(static=True, repr=False)
+
+    keeps_constraints: ClassVar[bool] = True
+
+    def __init__(self, pieces: Sequence[AbstractPiece]):
+        self.pieces = _checked_pieces(pieces)
+        self.positions = first_alike(self.pieces)
+
+    def _first_alike(self) -> tuple[int, ...]:
+        return self.positions
+
+    @property
+    def structure(self) -> Structure:
+        for flow in self._flows.values():
+            if is_solver(flow.flow):
+                return flow.flow.structure  # pyright: ignore
+        return "separable"
+
+    @property
+    def record(self) -> Record:  # pyright: ignore
+        return Record(
+            weak=2 if self.symmetric else 1,
+            strong=1,
+            choose="A splitting of your own for heat baths.",
+        )
+
+
+def _checked_pieces(pieces: Any) -> tuple[AbstractPiece, ...]:
+    """The pieces as a tuple. Raises a `ValueError` unless they are those of a splitting."""
+    if not isinstance(pieces, list | tuple):
+        raise ValueError(f"`pieces` must be a list of pieces; got {pieces!r}.")
+    for piece in pieces:
+        if not isinstance(piece, AbstractPiece):
+            raise ValueError(
+                "The pieces of a `Splitting` are such as `Kick(1 / 2)`, `Flight(1)`, "
+                f"`Bath(1)` and `Flow(1, solver)`; got {piece!r}."
+            )
+        if isinstance(piece, Flow):
+            check_has_no_bath(piece.flow)
+    kinds = [Kick, Bath]
+    kinds.append(Flow if any(isinstance(x, Flow) for x in pieces) else Flight)
+    if any(not isinstance(piece, tuple(kinds)) for piece in pieces):
+        raise ValueError(
+            "A `Splitting` with a `Flow` has no `Flight`: the flow moves the positions."
+        )
+    for kind in kinds:
+        total = sum(piece.share for piece in pieces if isinstance(piece, kind))
+        if abs(total - 1) > 1e-12:
+            raise ValueError(
+                "The shares of each kind of piece add up to one; those of "
+                f"`{kind.__name__}` add up to {total:.6g}."
+            )
+    num_baths = sum(isinstance(piece, Bath) for piece in pieces)
+    if num_baths > 2:
+        raise ValueError(
+            "A `Splitting` has one or two baths, which share the noise of a step by `W` "
+            f"and `H`; got {num_baths}."
+        )
+    return tuple(pieces)

@@ -14,7 +14,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import most_demanding_variable
-from diffrax_symplectic._solver import LANGEVIN, SOLVERS
+from diffrax_symplectic._solver import AbstractLangevinSplitting, LANGEVIN, SOLVERS
 from diffrax_symplectic._tableau import make_plan
 
 from ..picard import by_picard
@@ -50,10 +50,16 @@ def oscillator(time, y, args):
     return c * p - 2 * s * q, s / 2 * p + c * q
 
 
+# Two baths, which share the noise of a step, around a step of Verlet's method.
+OBABO = ds.Splitting(
+    [ds.Bath(1 / 2), ds.Kick(1 / 2), ds.Flight(1), ds.Kick(1 / 2), ds.Bath(1 / 2)]
+)
+
 # Those that treat a part of the drift by itself: the friction of their terms, or a flow
 # that the terms leave out.
 SPLIT = [
     *(solver() for solver in LANGEVIN),
+    OBABO,
     ds.BAOAB(ds.StormerVerlet()),
     ds.LinearFlow(ds.StormerVerlet(), oscillator),
 ]
@@ -71,7 +77,7 @@ STEPS = [
 
 
 def has_friction(solver) -> bool:
-    return isinstance(solver, LANGEVIN)
+    return isinstance(solver, AbstractLangevinSplitting)
 
 
 def terms_for(solver, *args, **kwargs):
