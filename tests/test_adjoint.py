@@ -105,12 +105,12 @@ def test_solvers_that_the_docstring_names_undo_their_steps():
 
 def test_the_message_names_the_steps_that_shrink_areas_to_zero():
     for solver in REVERSIBLE:
-        if isinstance(solver, AbstractLangevinSplitting):
+        if isinstance(solver, LANGEVIN):
             rate_times_step = solver.friction_without_inverse
             assert solver.area_factor(rate_times_step) == 0
             name = type(solver).__name__
             said = (
-                f"`{name}` with rate of friction times step equal to {rate_times_step}"
+                f"`{name}` with rate of friction times step equal to {rate_times_step:g}"
             )
             assert said in _steps_without_inverse()
 

@@ -136,7 +136,7 @@ def test_docs_list_every_solver():
 
 
 def test_every_class_of_solvers_is_public_and_in_the_tables():
-    known = {*SOLVERS, *LANGEVIN, ds.LinearFlow}
+    known = {*SOLVERS, *LANGEVIN, ds.Splitting, ds.LinearFlow}
     for info in pkgutil.iter_modules(_solver.__path__):
         module = importlib.import_module(f"{_solver.__name__}.{info.name}")
         for name, kind in vars(module).items():
