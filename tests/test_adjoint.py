@@ -109,9 +109,7 @@ def test_the_message_names_the_steps_that_shrink_areas_to_zero():
             rate_times_step = solver.friction_without_inverse
             assert solver.area_factor(rate_times_step) == 0
             name = type(solver).__name__
-            said = (
-                f"`{name}` with rate of friction times step equal to {rate_times_step:g}"
-            )
+            said = f"`{name}` with rate of friction times step equal to {rate_times_step:g}"
             assert said in _steps_without_inverse()
 
 

@@ -41,8 +41,9 @@ _NAMES_BY_COST = {
     20: "exp exp2 tanh",
     75: "acos acosh asin asinh atan atan2 atanh cos cosh cumlogsumexp cummax cummin "
     "cumprod cumsum erf erf_inv erfc expm1 lgamma log log1p logistic pow sin sinh tan",
-    # A call of the generator, which hashes in a loop.
-    150: "random_bits random_fold_in random_seed random_split threefry2x32",
+    # A call of the generator, which hashes in a loop; and a number that is looked up by its
+    # index, as in `q[i]` with an array `i`.
+    150: "gather random_bits random_fold_in random_seed random_split threefry2x32",
     900: "sort",
 }
 _COST_BY_NAME = {
@@ -50,6 +51,12 @@ _COST_BY_NAME = {
 }
 # Reductions read their arguments from memory: the cost for each number that they read.
 _OF_REDUCTION = 10
+# The cost for each number that is added by its index, as in the derivative of `q[i]`.
+_OF_SCATTER = 80
+# What a product of matrices or vectors takes besides its sums and products, for real and
+# for complex numbers.
+_OF_CALL = 300
+_OF_COMPLEX_CALL = 4_000
 
 
 @once_for_each_signature
@@ -91,16 +98,25 @@ def _operations_of(eqn: Any) -> int:
         return _OF_LAPACK
     if name.startswith("reduce_"):
         return _OF_REDUCTION * sum(map(_size, eqn.invars))
+    if name.startswith("scatter"):
+        return _OF_SCATTER * _size(eqn.invars[-1])
     size = sum(map(_size, eqn.outvars))
+    is_complex = any(map(_is_complex, eqn.outvars))
     if name == "dot_general":
-        (contracted_axes, _), _ = eqn.params["dimension_numbers"]
-        factor, _ = eqn.invars
-        shape = factor.aval.shape  # pyright: ignore (of arrays)
-        size *= math.prod(shape[axis] for axis in contracted_axes)
+        return _operations_of_product(eqn, size, is_complex)
     cost = _COST_BY_NAME.get(name, 1)
-    if any(_is_complex(x) for x in eqn.outvars):
-        cost *= _OF_COMPLEX
-    return cost * size
+    return cost * size * (_OF_COMPLEX if is_complex else 1)
+
+
+def _operations_of_product(eqn: Any, size: int, is_complex: bool) -> int:
+    """`_operations_of` a product of matrices or vectors with so many entries."""
+    (contracted_axes, _), _ = eqn.params["dimension_numbers"]
+    factor, _ = eqn.invars
+    shape = factor.aval.shape
+    num_products = size * math.prod(shape[axis] for axis in contracted_axes)
+    if is_complex:
+        return _OF_COMPLEX_CALL + _OF_COMPLEX * num_products
+    return _OF_CALL + num_products
 
 
 def _passes(eqn: Any) -> int:

@@ -59,7 +59,8 @@ def sine_in_a_loop_in_a_loop(x):
     [
         (three_sums, 3 * 5),
         (jax.jit(three_sums), 3 * 5),
-        (matrix_product, 3 * 5),
+        (matrix_product, 300 + 3 * 5),
+        (lambda x: x[jnp.array([0, 2])], 150 * 2 + 6),
         (seven_sums, 7 * 5),
         (either, (3 + 1) * 5),
         (lax.sin, 75 * 5),

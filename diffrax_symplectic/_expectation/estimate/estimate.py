@@ -325,11 +325,16 @@ class Expectation(eqx.Module):
                 "is taken for the error (take smaller steps)"
             )
         plural = "" if self.levels == 1 else "s"
-        sampling = "" if self.sampling is None else f", {self.sampling}"
-        lines.append(
+        line = (
             f"{self.num_paths:,} paths on {self.levels} level{plural}, "
-            f"{self.num_failed:,} failed{sampling}"
+            f"{self.num_failed:,} failed"
         )
+        if self.tol_reached is not None and self.sampling is not None:
+            # Its size is an upper limit.
+            line += f", {type(self.sampling).__name__} until `tol`"
+        elif self.sampling is not None:
+            line += f", {self.sampling}"
+        lines.append(line)
         if self.reason:
             lines.append(self.reason)
         if self.caveat:
