@@ -1,13 +1,6 @@
 """All benchmarks: `python -m examples.benchmarks`."""
 
-from . import (
-    calls,
-    ensemble,
-    speed,
-    tolerance,
-    total_error,
-    work_precision,
-)
+from . import calls, ensemble, speed, tolerance, work_precision
 
 
 def main() -> None:
@@ -16,9 +9,6 @@ def main() -> None:
     ensemble.main()
     tolerance.main()
     work_precision.main("errors", "seconds")
-    total_error.main("errors")
-    total_error.main("seconds")
-    total_error.main()
 
 
 if __name__ == "__main__":
