@@ -29,6 +29,10 @@ else:
     pass
 
 
+_HALF_KICK = Kick(1 / 2)
+_HALF_FLIGHT = Flight(1 / 2)
+_BATH = Bath(1)
+
 _FREE_FLIGHT = Record(
     weak=2,
     strong=1,
@@ -136,12 +140,11 @@ class BAOAB(AbstractLangevinSplitting):
 
     @property
     def pieces(self) -> tuple[AbstractPiece, ...]:  # pyright: ignore
-        kick = Kick(1 / 2)
         if self.flow is None:
-            move = Flight(1 / 2)
+            move = _HALF_FLIGHT
         else:
             move = Flow(1 / 2, self.flow, self.steps)
-        return (kick, move, Bath(1), move, kick)
+        return (_HALF_KICK, move, _BATH, move, _HALF_KICK)
 
     @property
     def record(self) -> Record:  # pyright: ignore
@@ -197,9 +200,9 @@ class LangevinMiddle(AbstractLangevinSplitting):
     structure: ClassVar[Structure] = "separable"
     pieces: ClassVar[tuple[AbstractPiece, ...]] = (
         Kick(1),
-        Flight(1 / 2),
-        Bath(1),
-        Flight(1 / 2),
+        _HALF_FLIGHT,
+        _BATH,
+        _HALF_FLIGHT,
     )
     record: ClassVar[Record] = Record(
         weak=1,

@@ -71,7 +71,7 @@ class Moving(NamedTuple):
     num_baths: int = 0
     normal_space: NormalSpace | None = None
     is_tangent: bool = True
-    found: Bool[Array, ""] | bool = True
+    found: Any = True
 
     def after_move(self, y: Y, share: float, **changes: Any) -> "Moving":
         """The state after the positions have moved for this share of the step."""
@@ -119,8 +119,7 @@ class AbstractPiece(eqx.Module):
         one."""
 
 
-def _share() -> Any:
-    return eqx.field(static=True, converter=ft.partial(real_number, "share"))
+_share = ft.partial(real_number, "share")
 
 
 class Kick(AbstractPiece):
@@ -128,7 +127,7 @@ class Kick(AbstractPiece):
     step. Forces are those of the whole drift; in a splitting with a
     [`diffrax_symplectic.Flow`][] those of the `slow` potential alone."""
 
-    share: float = _share()
+    share: float = eqx.field(static=True, converter=_share)
 
     def move(self, setting, moving, flow_state):
         if not setting.kicks:
@@ -148,7 +147,7 @@ class Flight(AbstractPiece):
     r"""Positions move by free flight, $q \gets q + s h\, \partial V / \partial p$, for the
     share $s$ of the step; under a constraint by a step of RATTLE, on its surface."""
 
-    share: float = _share()
+    share: float = eqx.field(static=True, converter=_share)
 
     def move(self, setting, moving, flow_state):
         if setting.surface is not None:
@@ -192,7 +191,7 @@ class Flow(AbstractPiece):
     **Raises:** a `ValueError` for any other flow.
     """
 
-    share: float = _share()
+    share: float = eqx.field(static=True, converter=_share)
     flow: AnyFlow
     steps: int = eqx.field(
         default=1, static=True, converter=ft.partial(whole_number, "steps")
@@ -233,7 +232,7 @@ class Bath(AbstractPiece):
 
     It keeps the Maxwell distribution exactly, for every friction and all masses."""
 
-    share: float = _share()
+    share: float = eqx.field(static=True, converter=_share)
 
     def __check_init__(self):
         if self.share <= 0:
@@ -307,8 +306,8 @@ def lengths_and_times(
 ) -> tuple[dict[float, RealScalarLike], dict[float, RealScalarLike]]:
     """The `lengths` and `times` of a `Setting`, for a step from `t0` to `t1`."""
     h = t1 - t0
-    lengths = {1.0: h}
-    times = {0.0: t0, 1.0: t1}
+    lengths: dict[float, Any] = {1.0: h}
+    times: dict[float, Any] = {0.0: t0, 1.0: t1}
     elapsed = 0.0
     for piece in pieces:
         if piece.share not in lengths:
