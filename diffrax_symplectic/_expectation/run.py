@@ -3,7 +3,7 @@
 import collections
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -16,7 +16,7 @@ from jaxtyping import Array, Key, PRNGKeyArray, PyTree
 from .._arguments import check_untraced
 from .._custom_types import Devices
 from .._programs import once_for_each_signature
-from .._solver import without_newton
+from .._solver import has_newton, without_newton
 from .batch import batch_moments, BatchMoments, quick_batch_moments
 from .estimate import (
     check_same,
@@ -103,21 +103,18 @@ def run(
     def needs_no_more_samples() -> bool:
         return _needs_no_more_samples(estimate, plan.least_samples, tol)
 
-    # With the number of the first sample of each.
-    running_batches: collections.deque[tuple[int, BatchMoments]] = collections.deque()
+    running_batches: collections.deque[_RunningBatch] = collections.deque()
     # One past the last sample of the batches that were started.
     end_of_started = next_sample
     while True:
         starts_batch = end_of_started < end and not needs_no_more_samples()
         if starts_batch:
-            running_batch = batches.start(end_of_started, end)
-            running_batches.append((end_of_started, running_batch))
+            running_batches.append(batches.start(end_of_started, end))
             end_of_started += batches.size * len(devices)
         # While the batch just started is being computed, the one before is added up.
         has_previous = len(running_batches) > (1 if starts_batch else 0)
         if has_previous:
-            of_devices = batches.moments_of_devices(*running_batches.popleft(), end)
-            for device_moments in of_devices:
+            for device_moments in batches.moments_of_devices(running_batches.popleft()):
                 # The moments of each device are a batch of their own: where to stop
                 # does not depend on how many devices there are.
                 if _end_of(estimate) == end or needs_no_more_samples():
@@ -160,6 +157,21 @@ def _with_batch(
     return dataclasses.replace(estimate, moments=moments)
 
 
+class _RunningBatch(NamedTuple):
+    """A batch that has been started.
+
+    - `first`, `end`: the number of its first sample, and from which on samples do not
+        count.
+    - `has_newton`: whether Newton's method solves steps that sweeps do not.
+    - `moments`: the moments on all devices, once they are computed.
+    """
+
+    first: int
+    end: int
+    has_newton: bool
+    moments: BatchMoments
+
+
 class _Batches:
     """The batches of a plan, in each of which every device takes `size` samples.
 
@@ -171,10 +183,11 @@ class _Batches:
         self.size = min(plan.batch_size, plan.num_samples)
         self.key_data = np.asarray(jr.key_data(key))
         self._key_impl = jr.key_impl(key)
-        sweeps_only = without_newton(plan.sampler)
-        self._may_need_newton = not eqx.tree_equal(sweeps_only, plan.sampler)
-        self._sampler = _for_all_processes(sweeps_only)
         self._sampler_with_newton = _for_all_processes(plan.sampler)
+        self._sampler = self._sampler_with_newton
+        # Paths that are computed outside JAX have been solved by then.
+        if plan.simulate_paths is None and has_newton(plan.sampler):
+            self._sampler = _for_all_processes(without_newton(plan.sampler))
         self._simulate_paths = plan.simulate_paths
         self._devices = devices
         self._struct = plan.struct
@@ -193,10 +206,12 @@ class _Batches:
         # `Partial` for its function, with the arrays in it, and compile anew for each.
         return jtu.Partial(_samples_of_paths, self._sampler, paths)
 
-    def start(self, first: int, end: int) -> BatchMoments:
+    def start(self, first: int, end: int) -> "_RunningBatch":
         """Starts a batch on all devices, from sample number `first` on. Samples from number
         `end` on do not count."""
-        return self._batch_moments(*self._arguments(first, end))
+        moments = self._batch_moments(*self._arguments(first, end))
+        has_newton = self._sampler is self._sampler_with_newton
+        return _RunningBatch(first, end, has_newton, moments)
 
     def _arguments(self, first: int, end: int) -> tuple[Any, ...]:
         """The arguments of `batch_moments`."""
@@ -217,17 +232,15 @@ class _Batches:
             self.size,
         )
 
-    def moments_of_devices(
-        self, first: int, running_batch: BatchMoments, end: int
-    ) -> list[BatchMoments]:
-        """The moments on each device of the batch from sample number `first` on, copied to
-        the host as soon as they are computed."""
+    def moments_of_devices(self, running_batch: "_RunningBatch") -> list[BatchMoments]:
+        """The moments on each device, copied to the host as soon as they are computed."""
         # The moments are traced if a function closes over traced values.
-        check_untraced("`expectation` or `monte_carlo`", running_batch)
-        arrays = jax.device_get(running_batch)
-        if self._may_need_newton and np.any(arrays.num_failed > 0):
+        check_untraced("`expectation` or `monte_carlo`", running_batch.moments)
+        arrays = jax.device_get(running_batch.moments)
+        if not running_batch.has_newton and np.any(arrays.num_failed > 0):
             self._sampler = self._sampler_with_newton
-            arrays = jax.device_get(self.start(first, end))
+            again = self.start(running_batch.first, running_batch.end)
+            arrays = jax.device_get(again.moments)
         num_devices = len(self._devices)
         return [jtu.tree_map(lambda x, k=k: x[k], arrays) for k in range(num_devices)]
 

@@ -34,7 +34,7 @@ from .fast_flow import LinearFlow
 from .flow import is_solver, kicks_and_rest
 from .linear_flow import linear_flow
 from .paths import common_path, own_path, path_of_array_cell
-from .root_finders import with_changed_stages, without_newton
+from .root_finders import has_newton, with_changed_stages, without_newton
 from .times import check_resolution
 
 

@@ -7,6 +7,7 @@ import os
 import socket
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import diffrax
@@ -437,3 +438,24 @@ def test_gradients_are_taken_within():
 def test_gradients_are_taken_within_on_several_devices():
     # The default adjoint is refused from JAX 0.10 on, and that of the advice works.
     np.testing.assert_allclose(_of_three_devices()[3], _mean_gradient(), rtol=1e-12)
+
+
+def test_newtons_method_takes_part_from_the_first_batch_that_needs_it():
+    # Sweeps solve no step in which an oscillator turns by 40.
+    stiff = lambda t, p, q, args: (p**2 + 400 * q**2) / 2
+    terms = ds.hamiltonian_terms(stiff, lambda t, p, q, args: -q, ())
+    few = ds.IndependentPaths(256, batch_size=64)
+
+    def estimate(root_finder):
+        solver = ds.ImplicitMidpoint(root_finder=root_finder)
+        y0 = jnp.array(0.0), jnp.array(1.0)
+        given = lambda t, y, args: y[0] ** 2, terms, solver, 0, 4, 2.0, y0
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "256 paths failed")
+            return ds.expectation(*given, key=jr.key(2), sampling=few, levels=1)
+
+    assert estimate(ds.PicardNewton(newton_steps=0)).num_failed > 200
+    got = estimate(ds.PicardNewton())
+    assert got.num_failed == 0 and got.num_paths == 256
+    other = estimate(optx.Newton(rtol=1e-12, atol=1e-12))
+    np.testing.assert_allclose(got.mean, other.mean, rtol=1e-9)
