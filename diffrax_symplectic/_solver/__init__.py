@@ -17,8 +17,6 @@ What they are made of:
 - `paths`: the path that a solver needs; `times`: whether times resolve a step.
 """
 
-import diffrax
-
 from .base import AbstractImplicitStages, AbstractSymplecticRungeKutta
 from .base import AbstractSymplecticSolver
 from .record import Record, Want
@@ -38,27 +36,25 @@ from .root_finders import has_newton, with_changed_stages, without_newton
 from .times import check_resolution
 
 
-# All solvers, in the order of the imports above, which is that of the documentation.
-# Abstract classes have no record.
-_ALL = [
-    solver_class
-    for solver_class in tuple(globals().values())
-    if isinstance(solver_class, type)
-    and issubclass(solver_class, AbstractSymplecticSolver)
-    if solver_class.record is not None
-]
-# Those that need friction, from `langevin_terms`, and have pieces by default.
-LANGEVIN: tuple[type[AbstractLangevinSplitting], ...] = tuple(
-    solver_class
-    for solver_class in _ALL
-    if issubclass(solver_class, AbstractLangevinSplitting)
-    and solver_class is not Splitting
-)
-# All others that do not wrap another solver.
-SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = tuple(
-    solver_class
-    for solver_class in _ALL
-    if not issubclass(
-        solver_class, AbstractLangevinSplitting | diffrax.AbstractWrappedSolver
-    )
+# The solvers with default arguments, in the order of the documentation: those that need
+# friction, from `langevin_terms`, and all others that do not wrap another solver.
+LANGEVIN: tuple[type[AbstractLangevinSplitting], ...] = (BAOAB, LangevinMiddle)
+SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = (
+    ImplicitMidpoint,
+    SRKs1,
+    SRKw1,
+    SRKw2,
+    StrangGauss,
+    NinomiyaVictoir,
+    PlateauGauss,
+    LevyAreaMidpoint,
+    SRKs2,
+    SRKs3,
+    SRKw3,
+    SRKw4,
+    StormerVerlet,
+    PlateauVerlet,
+    SRKs4,
+    SRKw5,
+    AdditiveGauss,
 )
