@@ -9,7 +9,6 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from ..families import slow_except
 from .messages import messages
 
 
@@ -57,7 +56,12 @@ EXACT = -0.00025
 
 
 @pytest.mark.parametrize(
-    "h, levels", slow_except([(0.4, 2)], [(0.2, 2), (0.4, 2), (0.4, 3)])
+    "h, levels",
+    [
+        (0.4, 2),
+        pytest.param(0.2, 2, marks=pytest.mark.slow),
+        pytest.param(0.4, 3, marks=pytest.mark.slow),
+    ],
 )
 def test_a_drive_whose_period_divides_all_steps_is_told(h, levels):
     got, message = _estimate(_driven(_tenfold), ds.BAOAB(), h, levels=levels)
