@@ -372,10 +372,11 @@ def test_backsolve_is_refused_with_advice(solver):
     "inner, form",
     [
         (ds.StormerVerlet(), jnp.array([[1.0, 0.4], [0.4, 0.7]])),
-        pytest.param(ds.ImplicitMidpoint(), jnp.array(1.0), marks=pytest.mark.slow),
+        (ds.ImplicitMidpoint(), jnp.array(1.0)),
     ],
     ids=["matrix", "number"],
 )
+@pytest.mark.slow
 def test_friction_beside_a_flow_is_walked_back_too(inner, form):
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 - args * jnp.sum(jnp.cos(q + t))
     noise = lambda t, p, q, args: args * jnp.sum(jnp.sin(q))

@@ -72,6 +72,7 @@ def test_terms_of_a_path_are_complete_if_the_terms_had_a_shape():
 @pytest.mark.parametrize(
     "solver", [ds.AdditiveGauss(), ds.SRKw5(), ds.NinomiyaVictoir()]
 )
+@pytest.mark.slow
 def test_weak_methods_have_no_paths_with_the_law_of_the_solution(solver):
     kick = ds.hamiltonian_terms(pendulum, lambda t, p, q, args: -q, ())
     name = type(solver).__name__

@@ -65,6 +65,7 @@ def test_the_estimate_is_exact_up_to_the_spread_that_it_reports():
 
 
 @pytest.mark.core
+@pytest.mark.slow
 def test_paths_in_blocks_are_those_of_one_batch(monkeypatch):
     whole = _estimate(phi=SQUARE, levels=2)
     # Another function, so that programs are compiled anew.

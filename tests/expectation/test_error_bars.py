@@ -114,6 +114,7 @@ def test_single_precision_knows_the_spread_of_small_and_large_numbers(size):
         assert run(size, tol=0.01 * float(size)).num_paths == 4000
 
 
+@pytest.mark.slow
 def test_an_expectation_in_single_precision_does_not_know_units():
     f4 = jax.ShapeDtypeStruct((), jnp.float32)
     terms = kubo_terms(ds.WeakBrownianPath(f4, KEY))

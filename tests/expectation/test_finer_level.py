@@ -115,6 +115,7 @@ def test_momenta_that_steps_hardly_damp_are_told(solver, friction):
     assert message is not None
 
 
+@pytest.mark.slow
 def test_errors_that_change_their_sign_between_the_levels_are_told():
     # Noise turns the momenta of an oscillator in a plane, and the error of order 1 is zero
     # between both steps. With value functions the trial sees that on a handful of paths.

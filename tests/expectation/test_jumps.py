@@ -226,6 +226,7 @@ def test_steps_that_end_at_the_jump_give_the_right_mean_and_are_not_told():
     assert message is None
 
 
+@pytest.mark.slow
 def test_three_levels_tell_of_jumps_within_steps_too():
     H0, T = _within_steps("temperature")
     got, message = _estimate(H0, ds.BAOAB(), 0.25, T=T, levels=3)
@@ -297,10 +298,9 @@ def test_noise_that_jumps_at_a_step_end_is_told_for_solvers_that_take_it_there(s
 
 
 @pytest.mark.parametrize(
-    "solver",
-    [pytest.param(ds.ImplicitMidpoint(), marks=pytest.mark.slow), ds.StormerVerlet()],
-    ids=repr,
+    "solver", [ds.ImplicitMidpoint(), ds.StormerVerlet()], ids=repr
 )
+@pytest.mark.slow
 def test_solvers_that_take_noise_within_steps_are_right_where_it_jumps(solver):
     got, message = _estimate(None, solver, 0.25, terms=WITH_JUMPING_NOISE)
     assert abs(got.mean - EXACT_WITH_NOISE) < got.error

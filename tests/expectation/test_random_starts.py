@@ -72,6 +72,7 @@ def test_means_over_drawn_starts_and_args_are_right(sampling):
     assert estimate.num_failed == 0
 
 
+@pytest.mark.slow
 def test_value_functions_leave_the_variance_of_the_start():
     fixed = {"strength": jnp.array(0.01)}
     estimate = mean(ds.ValueFunctions(degree=2, num_paths=4000), args=fixed)

@@ -73,7 +73,7 @@ def test_units_make_no_difference_to_linear_systems(n, scale):
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-@pytest.mark.parametrize("n", slow_except([3, 12], [3, 6, 12, 40]))
+@pytest.mark.parametrize("n", slow_except([3], [3, 6, 12, 40]))
 def test_derivatives_are_solved_whether_iteration_converges_or_not(n, dtype):
     # Symmetric and antisymmetric matrices, of spectral radii on both sides of one and of
     # what is accelerated, side by side in one batch.

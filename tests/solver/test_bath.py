@@ -144,6 +144,7 @@ print("lapack" in entry, "lapack" in before)
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="LAPACK serves CPUs")
+@pytest.mark.slow
 def test_a_constant_matrix_is_diagonalized_once_before_the_loop_over_steps():
     # As users compile it: the suite leaves this optimization out.
     left_out = ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS")

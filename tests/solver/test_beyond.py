@@ -105,6 +105,7 @@ def _strong_errors(solver, strength, m=2, fine=2**11, samples=200):
     return 1 / numbers, np.sqrt(np.mean(np.sum(errors**2, axis=-1), axis=1))
 
 
+@pytest.mark.slow
 def test_plateau_verlet_is_strong_order_three_halves():
     steps, errors = _strong_errors(ds.PlateauVerlet(), 6.0)
     assert ds.PlateauVerlet().strong_order(None) == 1.5

@@ -321,6 +321,7 @@ def _diffrax_terms(path, gamma=GAMMA):
 
 
 @each_splitting
+@pytest.mark.slow
 def test_terms_of_diffrax_are_taken_as_they_are(solver):
     path = solver.path((2,), jr.key(0), want="weak")
     H0 = lambda t, p, q, args: jnp.sum(U * p**2 / 2 + q**4 / 4 - args * jnp.cos(q))

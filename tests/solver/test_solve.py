@@ -113,6 +113,7 @@ def test_gradients_equal_central_differences(solver, path):
     np.testing.assert_allclose(gradient, differences, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_adjoints_agree():
     y0, args = random_problem(jr.key(0), 1, 2)
     terms = ds.hamiltonian_terms(H0, noise, weak_path(2))

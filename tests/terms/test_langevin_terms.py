@@ -387,6 +387,7 @@ def test_numbers_for_each_particle_are_repeated_along_the_axes_of_space():
             solve(1.0, given)
 
 
+@pytest.mark.slow
 def test_a_matrix_for_momenta_with_two_axes_is_an_operator_on_their_structure():
     n, d = 2, 3
     flat = jr.normal(jr.key(5), (n * d, n * d))

@@ -68,7 +68,6 @@ QUICK = [
     (ds.BAOAB(), "array"),
     (ds.BAOAB(), "matrix"),
     (ds.BAOAB(), "along"),
-    (ds.ImplicitMidpoint(), "wall"),
 ]
 # Each of the others once, with the one or the other solver in turn.
 OTHERS = zip(itertools.cycle([ds.BAOAB(), ds.ImplicitMidpoint()]), CASES)

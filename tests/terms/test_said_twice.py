@@ -111,6 +111,7 @@ def test_noise_alone_is_that_of_the_whole_terms():
         ds.noise_terms(SPRING, None)
 
 
+@pytest.mark.slow
 def test_two_paths_are_one_of_two_noises():
     both = lambda t, p, q, args: jnp.stack([SPRING(t, p, q, args), 0.3 * q])
     together = ds.hamiltonian_terms(WELL, both, ds.WeakBrownianPath((2,), jr.key(0)))

@@ -177,6 +177,7 @@ def test_ninomiya_victoir_is_weak_order_two_for_noises_that_do_not_commute():
     np.testing.assert_allclose(slopes, 3.0, atol=0.1)
 
 
+@pytest.mark.slow
 def test_noises_of_spins_may_be_indexed():
     s0, args = _problem(jr.key(0), 2, 3)
     y0 = ds.to_spinors(s0)
