@@ -37,6 +37,9 @@ _MOST_COMPONENTS_SORTED = 4
 # indicator and a call option on the pendulum fits left 26% and 1.3%, and sorted paths had
 # error bars that were 23 and 8 times less.
 _MOST_REMAINDER = 0.01
+# Without a tolerance, value functions take this part of their paths if the error of the
+# steps is far larger. (Fewer may miss rare paths.)
+_PART_BESIDE_STEPS = 4
 # The number of independent paths without a tolerance. (The other samplings have defaults.)
 _PATHS = 2**17
 # With a tolerance, which ends the estimate, the number of samples is without limit.
@@ -122,6 +125,10 @@ def choose(problem_for: Callable[[Want], Problem], request: Request) -> Decision
     plan = plan._replace(
         reason=reason, rounding_floor=problem.finest_steps, digests=problem.digests
     )
+    if is_open and isinstance(sampling, ValueFunctions):
+        # The path of a fit takes far longer than another.
+        least = plan.num_samples // _PART_BESIDE_STEPS
+        plan = plan._replace(least_beside_steps=least)
     if start is not None and tol is None and plan.num_samples == _MOST_SAMPLES:
         # `start` had a tolerance, and this call has none: it takes no further samples.
         num_taken = start.moments[-1].end - start.moments[0].begin

@@ -23,6 +23,7 @@ from .estimate import (
     combined_in_halves,
     Expectation,
     ExpectationInterrupted,
+    is_bounded_by_steps,
     is_reached,
     is_stuck,
     Moments,
@@ -101,7 +102,7 @@ def run(
         kept.estimate = estimate
 
     def needs_no_more_samples() -> bool:
-        return _needs_no_more_samples(estimate, plan.least_samples, tol)
+        return _needs_no_more_samples(estimate, plan, tol)
 
     running_batches: collections.deque[_RunningBatch] = collections.deque()
     # One past the last sample of the batches that were started.
@@ -318,9 +319,12 @@ def _in_float64(
 
 
 def _needs_no_more_samples(
-    estimate: Expectation, least_samples: int, tol: float | None
+    estimate: Expectation, plan: SamplingPlan, tol: float | None
 ) -> bool:
     """Whether there are enough samples for the tolerance, or more would not help."""
-    if tol is None or estimate.num_samples < least_samples:
+    least = plan.least_beside_steps if tol is None else plan.least_samples
+    if least is None or estimate.num_samples < least:
         return False
+    if tol is None:
+        return is_bounded_by_steps(estimate)
     return is_reached(estimate, tol) or is_stuck(estimate, tol)

@@ -76,6 +76,9 @@ class SamplingPlan(NamedTuple):
     - `paths_per_sample`: the number of paths in a sample, on each level.
     - `levels`: the number of levels.
     - `least_samples`: the fewest samples whose variance is estimated well enough to stop.
+    - `least_beside_steps`: the fewest samples after which an estimate without a tolerance
+        ends if its sampling error is a small part of that of the steps; `None` if it does
+        not.
     - `reason`: why this sampling was chosen, for the result.
     - `remainder`: the largest fraction of a standard error that a control variate leaves of
         it, by trials.
@@ -95,6 +98,7 @@ class SamplingPlan(NamedTuple):
     paths_per_sample: int = 1
     levels: int = 1
     least_samples: int = 2
+    least_beside_steps: int | None = None
     reason: str = ""
     remainder: float = 0.0
     struct: Averaged | None = None

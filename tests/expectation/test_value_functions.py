@@ -455,3 +455,17 @@ def test_the_default_sorts_paths_where_a_fit_leaves_much():
     assert got.std_error < fitted.std_error / 5
     # A smooth function keeps its fit.
     assert isinstance(_estimate(None).sampling, ds.ValueFunctions)
+
+
+def test_the_default_ends_where_the_error_of_the_steps_is_far_larger():
+    oscillator = lambda t, p, q, args: (p**2 + q**2) / 2
+    terms = ds.hamiltonian_terms(oscillator, lambda t, p, q, args: -q, ())
+    square = lambda t, y, args: y[1] ** 2
+    y0 = jnp.array(0.0), jnp.array(1.0)
+    given = square, terms, ds.StormerVerlet(), 0, 1, 0.25, y0
+    got = ds.expectation(*given, key=jr.key(0))
+    assert got.num_paths == 1024
+    assert got.std_error < 0.1 * got.discretization_error
+    # As many as the user asks for.
+    whole = ds.expectation(*given, key=jr.key(0), sampling=ds.ValueFunctions())
+    assert whole.num_paths == 4096

@@ -16,4 +16,11 @@ from .estimate import (
     label_of,
 )
 from .moments import combined_in_halves, Moments, total
-from .tolerance import is_reached, is_stuck, largest_error, needs_level, share_of_needed
+from .tolerance import (
+    is_bounded_by_steps,
+    is_reached,
+    is_stuck,
+    largest_error,
+    needs_level,
+    share_of_needed,
+)

@@ -12,6 +12,9 @@ from .estimate import combined_results, Expectation
 # without it an error as large as the tolerance would be less by about an eighth at
 # most.
 _SHARE_OF_SAMPLING = 0.5
+# The same without a tolerance, for the share of the discretization error: then the sampling
+# error is a half percent of the whole.
+_SHARE_BESIDE_STEPS = 0.1
 # What remains of the discretization error is known up to noise. By chance it exceeds the
 # tolerance by this many of its standard errors once in fifty times.
 _ERRORS_BY_CHANCE = 2
@@ -30,6 +33,21 @@ def is_stuck(estimate: Expectation, tol: float) -> bool:
     # failed paths.
     has_enough_samples = _all_within(estimate.std_error, _SHARE_OF_SAMPLING * tol)
     return has_enough_samples and not _all_within(estimate.error, tol)
+
+
+def is_bounded_by_steps(estimate: Expectation) -> bool:
+    """Whether the sampling error of each mean is a small part of the error of the steps,
+    which more samples would not change."""
+    if estimate.levels == 1 or estimate.num_failed > 0:
+        return False
+
+    def is_small(std_error: np.ndarray, discretization_error: np.ndarray) -> np.bool_:
+        return np.all(std_error <= _SHARE_BESIDE_STEPS * discretization_error)
+
+    are_small = jtu.tree_map(
+        is_small, estimate.std_error, estimate.discretization_error
+    )
+    return all(jtu.tree_leaves(are_small))
 
 
 def needs_level(estimate: Expectation, tol: float) -> bool:
