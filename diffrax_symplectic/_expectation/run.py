@@ -16,6 +16,7 @@ from jaxtyping import Array, Key, PRNGKeyArray, PyTree
 from .._arguments import check_untraced
 from .._custom_types import Devices
 from .._programs import once_for_each_signature
+from .._simulation import Problem
 from .._solver import has_newton, without_newton
 from .batch import batch_moments, BatchMoments, quick_batch_moments
 from .estimate import (
@@ -187,8 +188,8 @@ class _Batches:
         self._sampler_with_newton = _for_all_processes(plan.sampler)
         self._sampler = self._sampler_with_newton
         # Paths that are computed outside JAX have been solved by then.
-        if plan.simulate_paths is None and has_newton(plan.sampler):
-            self._sampler = _for_all_processes(without_newton(plan.sampler))
+        if plan.simulate_paths is None and _has_newton(plan.sampler):
+            self._sampler = _for_all_processes(_by_sweeps_alone(plan.sampler))
         self._simulate_paths = plan.simulate_paths
         self._devices = devices
         self._struct = plan.struct
@@ -267,6 +268,28 @@ class _Batches:
             size=zeros,
             dtypes=jtu.tree_map(lambda x: str(x.dtype), struct.value),
         )
+
+
+def _is_problem(x: Any) -> bool:
+    return isinstance(x, Problem)
+
+
+def _has_newton(sampler: Callable[..., Samples]) -> bool:
+    """Whether Newton's method may solve steps of the paths that a sampler simulates."""
+    parts = jtu.tree_leaves(sampler, is_leaf=_is_problem)
+    return any(_is_problem(x) and has_newton(x.solver) for x in parts)
+
+
+def _by_sweeps_alone(sampler: Callable[..., Samples]) -> Callable[..., Samples]:
+    """The sampler without Newton's method. Solvers within a user's own function, which
+    reports its failures by itself, stay as they are."""
+
+    def by_sweeps_alone(x: Any) -> Any:
+        if not _is_problem(x):
+            return x
+        return dataclasses.replace(x, solver=without_newton(x.solver))
+
+    return jtu.tree_map(by_sweeps_alone, sampler, is_leaf=_is_problem)
 
 
 def _for_all_processes(sampler: Callable[..., Samples]) -> Callable[..., Samples]:

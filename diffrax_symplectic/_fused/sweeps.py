@@ -70,6 +70,13 @@ class _Equations(NamedTuple):
         """The unknowns of an iterate."""
         return y if self.in_halves else y.q
 
+    def solution(self, y: Halves) -> PyTree[Array]:
+        """The unknowns after the last sweep."""
+        # The halves differ by the last correction, which may be larger than the tolerance:
+        # convergence is decided by the next one. With the new half of another sweep, paths
+        # of a field with jumps were off by 0.7 units in the last place, and without by 49.
+        return y if self.in_halves else self.image(y.q)
+
     def correction(self, old: Halves, new: Halves) -> PyTree[Array]:
         """The change of the unknowns by the last sweep, from `old` to `new`; for doubled
         equations the difference of the two halves, since only equal halves are a
@@ -174,7 +181,7 @@ def solve_one_path(
     num_sweeps = jnp.full((), 3, jnp.int32)
     state = _SweepState(third, size, counts_as_solved, num_sweeps)
     end = lax.while_loop(goes_on, sweep_again, state)
-    return equations.value(end.y), end.is_solved
+    return equations.solution(end.y), end.is_solved
 
 
 def _criterion(scale: PyTree[Array], dtype: Any) -> _Criterion:

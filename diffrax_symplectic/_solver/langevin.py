@@ -1,32 +1,16 @@
 """Splittings for Langevin dynamics that have names of their own."""
 
 import functools as ft
-from typing import ClassVar, TYPE_CHECKING
+from typing import ClassVar
 
 import equinox as eqx
 
 from .._arguments import whole_number
 from .._tableau import Structure
-from .flow import (
-    check_flow,
-    Flow as AnyFlow,
-    is_solver,
-)
-from .pieces import (
-    AbstractPiece,
-    Bath,
-    Flight,
-    Flow,
-    Kick,
-)
+from .flow import check_flow, Flow as AnyFlow, is_solver
+from .pieces import AbstractPiece, Bath, Flight, Flow, Kick
 from .record import Record
 from .splitting import AbstractLangevinSplitting, check_has_no_bath
-
-
-if TYPE_CHECKING:
-    pass
-else:
-    pass
 
 
 _HALF_KICK = Kick(1 / 2)

@@ -3,7 +3,7 @@
 import abc
 import functools as ft
 from collections.abc import Callable
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
 import diffrax
 import equinox as eqx
@@ -22,9 +22,9 @@ from .flow import after_flow, check_flow, Flow as AnyFlow, is_solver, moved
 
 
 if TYPE_CHECKING:
-    from typing import ClassVar as AbstractVar
+    from typing import ClassVar as AbstractClassVar, ClassVar as AbstractVar
 else:
-    from equinox import AbstractVar
+    from equinox import AbstractClassVar, AbstractVar
 
 
 class Setting(NamedTuple):
@@ -110,6 +110,7 @@ class AbstractPiece(eqx.Module):
     momenta, positions, or both."""
 
     share: AbstractVar[float]
+    moves_positions: AbstractClassVar[bool]
 
     @abc.abstractmethod
     def move(
@@ -125,8 +126,14 @@ _share = ft.partial(real_number, "share")
 class Kick(AbstractPiece):
     r"""Momenta move by the forces, $p \gets p + s h f(t, q)$, for the share $s$ of the
     step. Forces are those of the whole drift; in a splitting with a
-    [`diffrax_symplectic.Flow`][] those of the `slow` potential alone."""
+    [`diffrax_symplectic.Flow`][] those of the `slow` potential alone.
 
+    **Arguments:**
+
+    - `share`: the share of the step, a number.
+    """
+
+    moves_positions: ClassVar[bool] = False
     share: float = eqx.field(static=True, converter=_share)
 
     def move(self, setting, moving, flow_state):
@@ -145,8 +152,14 @@ class Kick(AbstractPiece):
 
 class Flight(AbstractPiece):
     r"""Positions move by free flight, $q \gets q + s h\, \partial V / \partial p$, for the
-    share $s$ of the step; under a constraint by a step of RATTLE, on its surface."""
+    share $s$ of the step; under a constraint by a step of RATTLE, on its surface.
 
+    **Arguments:**
+
+    - `share`: the share of the step, a number.
+    """
+
+    moves_positions: ClassVar[bool] = True
     share: float = eqx.field(static=True, converter=_share)
 
     def move(self, setting, moving, flow_state):
@@ -191,6 +204,7 @@ class Flow(AbstractPiece):
     **Raises:** a `ValueError` for any other flow.
     """
 
+    moves_positions: ClassVar[bool] = True
     share: float = eqx.field(static=True, converter=_share)
     flow: AnyFlow
     steps: int = eqx.field(
@@ -230,8 +244,16 @@ class Bath(AbstractPiece):
 
     $$\bar p = p - s h\, G g(\tfrac12 (p + \bar p)) + B W_s, \qquad p \gets \bar p$$
 
-    It keeps the Maxwell distribution exactly, for every friction and all masses."""
+    It keeps the Maxwell distribution exactly, for every friction and all masses.
 
+    **Arguments:**
+
+    - `share`: the share of the step, a positive number.
+
+    **Raises:** a `ValueError` for any other share.
+    """
+
+    moves_positions: ClassVar[bool] = False
     share: float = eqx.field(static=True, converter=_share)
 
     def __check_init__(self):
@@ -312,7 +334,7 @@ def lengths_and_times(
     for piece in pieces:
         if piece.share not in lengths:
             lengths[piece.share] = piece.share * h
-        if isinstance(piece, Flight | Flow):
+        if piece.moves_positions:
             elapsed = _rounded(elapsed + piece.share)
         if elapsed in times:
             continue
@@ -343,6 +365,6 @@ def _are_alike(one: AbstractPiece, other: AbstractPiece) -> bool:
 def is_known_at_ends(pieces: tuple[AbstractPiece, ...]) -> bool:
     """Whether forces at the end of a step are those at the start of the next one: whether
     there is a kick before positions move, and one after they did."""
-    moves = [i for i, piece in enumerate(pieces) if isinstance(piece, Flight | Flow)]
+    moves = [i for i, piece in enumerate(pieces) if piece.moves_positions]
     kicks = [i for i, piece in enumerate(pieces) if isinstance(piece, Kick)]
     return kicks[0] < moves[0] and kicks[-1] > moves[-1]

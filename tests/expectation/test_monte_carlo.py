@@ -11,6 +11,7 @@ import warnings
 from pathlib import Path
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -459,3 +460,17 @@ def test_newtons_method_takes_part_from_the_first_batch_that_needs_it():
     assert got.num_failed == 0 and got.num_paths == 256
     other = estimate(optx.Newton(rtol=1e-12, atol=1e-12))
     np.testing.assert_allclose(got.mean, other.mean, rtol=1e-9)
+
+
+class _Steps(eqx.Module):
+    """A function that holds a solver, and says how it solves its steps."""
+
+    solver: ds.ImplicitMidpoint
+
+    def __call__(self, key):
+        return jr.normal(key) + self.solver.root_finder.newton_steps  # pyright: ignore
+
+
+def test_a_solver_in_a_function_of_the_user_keeps_newtons_method():
+    got = ds.monte_carlo(_Steps(ds.ImplicitMidpoint()), key=jr.key(0), num_paths=64)
+    assert got.mean > 90

@@ -26,9 +26,8 @@ LONG = [
 # A table is returned by a branch, for a checkpoint in the other one. JAX 0.12 makes another
 # program of it, which is replayed.
 MAY_BE_REFUSED = {93}
-# Four steps, each of up to four systems of equations, which are solved to a few roundings;
-# units in the last place of the largest number.
-ULPS = 64
+# Four steps; units in the last place of the largest number.
+ULPS = 32
 
 
 def measured(numbers: list[int]) -> tuple[dict[int, float | str], str]:

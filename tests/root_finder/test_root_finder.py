@@ -12,6 +12,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._batch import most_of_batch
+from diffrax_symplectic._fused.sweeps import solve_one_path
 from diffrax_symplectic._root_finder.tolerance import converged, max_norm
 
 
@@ -403,3 +404,25 @@ def test_the_norm_of_a_correction_tells_what_is_not_a_number(n):
             expected = np.where(np.arange(3000) % 7 == 0, bad, 2.0)
             np.testing.assert_array_equal(norms, expected)
     assert np.isnan(max_norm(jnp.full((n, 1), jnp.nan)))
+
+
+def test_doubled_equations_with_kinks_are_solved_to_rounding_error_in_a_kernel():
+    @jax.jit
+    def solution(near, far, kink):
+        def image(y):
+            return jnp.stack(
+                [near * jnp.abs(y[0] - kink) + far * y[1] + 1, far * y[0] + 0.7]
+            )
+
+        y, is_solved = solve_one_path(image, jnp.abs, jnp.zeros(2), jnp.array(True))
+        exact = jax.lax.fori_loop(0, 300, lambda _, y: image(y), y)
+        return y, is_solved, exact
+
+    rng = np.random.default_rng(0)
+    for size in 10.0 ** -rng.uniform(1, 3, 200):
+        near, far, kink = size * rng.normal(size=3)
+        y, is_solved, exact = solution(near, far, 1 + kink)
+        assert is_solved
+        # Of the largest number, 1.5 units in the last place.
+        bound = 1.5 * np.finfo(float).eps * np.max(np.abs(exact))
+        assert np.max(np.abs(y - exact)) <= bound
