@@ -86,7 +86,6 @@ def run(
         sampling=sampling,
         reason=plan.reason,
         tol_reached=None if tol is None else False,
-        tails=plan.tails,
         digests=plan.digests,
         ts=ts,
     )

@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
-import numpy as np
 from jaxtyping import Array, Bool, Int, PRNGKeyArray, PyTree
 
 from .._custom_types import Devices
@@ -31,8 +30,6 @@ class Averaged(NamedTuple):
     - `plain`: for a path with a control variate, its value without the control variate.
     - `control`: for a path with a control variate, the control variate, which is `plain`
         minus `value`.
-    - `tails`: for a path with a control variate, its deviation from the mean, if that is in
-        the tails, and otherwise zero.
     """
 
     value: PyTree
@@ -40,7 +37,6 @@ class Averaged(NamedTuple):
     largest: Any = None
     plain: Any = None
     control: Any = None
-    tails: Any = None
 
     @property
     def fields(self) -> dict[str, PyTree]:
@@ -87,7 +83,7 @@ class SamplingPlan(NamedTuple):
     - `is_quick`: whether the samples take less time than compiling their program, which is
         then compiled for speed of compilation.
     - `is_fit_quick`: whether the plan holds a fit that took less time than this.
-    - `tails`, `rounding_floor`, `digests`: as in `Expectation`.
+    - `rounding_floor`, `digests`: as in `Expectation`.
     - `simulate_paths`: for paths computed outside JAX, maps the number of the first sample
         and the number of samples to an argument that the sampler takes before the keys.
     """
@@ -104,7 +100,6 @@ class SamplingPlan(NamedTuple):
     struct: Averaged | None = None
     is_quick: bool = False
     is_fit_quick: bool = False
-    tails: PyTree[np.ndarray] | None = None
     rounding_floor: int = 1
     digests: dict[str, str] | None = None
     simulate_paths: Callable[[int, int], Any] | None = None

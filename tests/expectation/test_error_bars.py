@@ -151,22 +151,17 @@ def test_few_samples_that_make_up_for_the_spread_widen_it_and_are_told():
     np.testing.assert_allclose(light.std_error, np.sqrt(light.variance / 2000))
 
 
-def _with_control(shift: float, spread: float = 1.0, tails: float = 0.0):
-    """Standard normal numbers, less a control that has the mean `shift`, and `tails` from
-    it in the tails, which are not among them."""
+def _with_control(shift: float, spread: float = 1.0):
+    """Standard normal numbers, less a control that has the mean `shift`."""
 
     def sampler(keys):
         x = jax.vmap(jr.normal)(keys)
         control = spread * x + shift
-        own, plain, control, none = (
-            value[None] for value in (x - control, x, control, jnp.zeros_like(x))
-        )
-        averaged = Averaged(own, plain=plain, control=control, tails=none)
+        own, plain, control = (value[None] for value in (x - control, x, control))
+        averaged = Averaged(own, plain=plain, control=control)
         return Samples(averaged, jnp.ones(len(keys), bool), jnp.zeros((1, len(keys))))
 
-    plan = SamplingPlan(
-        jax.tree_util.Partial(sampler), 1000, 250, tails=np.array([tails])
-    )
+    plan = SamplingPlan(jax.tree_util.Partial(sampler), 1000, 250)
     return run(plan, KEY, tuple(jax.devices()[:1]))
 
 
@@ -182,11 +177,6 @@ def test_a_control_whose_mean_is_not_zero_is_dropped():
     assert _with_control(np.nan).mean == biased.mean
     assert "A control variate was dropped" in " ".join(cautions(biased, None, ""))
     assert not list(cautions(fine, None, ""))
-
-
-def test_tails_that_no_sample_shows_widen_the_standard_error():
-    fine, tails = _with_control(0.0, 0.875), _with_control(0.0, 0.875, tails=0.5)
-    np.testing.assert_allclose(tails.std_error, np.hypot(fine.std_error, 0.5))
 
 
 def test_plain_terms_are_refused_where_a_solver_takes_them_for_ito():

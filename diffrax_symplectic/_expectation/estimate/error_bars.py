@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Float, PyTree
+from jaxtyping import PyTree
 
 from ..._simulation import Combination
 from ..sampling import Averaged, ROUNDING
@@ -79,27 +79,20 @@ class Results(NamedTuple):
 def results_of(
     moments: Moments,
     rounding_floor: int,
-    tails: PyTree[np.ndarray] | None,
     combination: Combination,
 ) -> Results:
     """The results for one combination of levels.
 
     Each array of `moments.mean` has the shape `(combinations, ...)`, where the dots are the
-    axes of one array of the mean; so has each array of `tails`. `rounding_floor`
-    and `tails` are those of `Expectation`.
+    axes of one array of the mean. `rounding_floor` is that of `Expectation`.
     """
     treedef = jtu.tree_structure(moments.mean.value)
-    # Only value functions estimate tails by paths of their own. Without them, deviations of
-    # zero add nothing to the standard errors.
-    if tails is None:
-        tails = jtu.tree_map(np.zeros_like, moments.mean.value)
     moments_of_arrays = map(
         _ArrayMoments,
         _split_by_array(moments.mean),
         _split_by_array(moments.norm),
         _split_by_array(moments.largest),
         jtu.tree_leaves(moments.dtypes),
-        jtu.tree_leaves(tails),
     )
     results_of_arrays = [
         _results_of_array(moments.num_good, rounding_floor, of_array)
@@ -118,15 +111,12 @@ class _ArrayMoments(NamedTuple):
 
     - `mean`, `norm`, `largest`: as in `Moments`.
     - `dtype`: the dtype in which the array was computed.
-    - `tails`: the mean absolute deviation in the tails, as paths with wider noise estimate
-        it.
     """
 
     mean: Averaged
     norm: Averaged
     largest: Averaged
     dtype: str
-    tails: Float[np.ndarray, "combinations ..."]
 
 
 def _split_by_array(averaged: Averaged) -> list[Averaged]:
@@ -171,8 +161,7 @@ def _results_of_array(n: int, rounding_floor: int, moments: _ArrayMoments) -> Re
 def _results_with_control(
     results: Results, n: int, rounding: np.ndarray, moments: _ArrayMoments
 ) -> Results:
-    """The results for values with a control variate, without it where it is dropped, and
-    with an allowance for tails that no sample shows."""
+    """The results for values with a control variate, without it where it is dropped."""
     mean = moments.mean
     control_spread = _spread_of(
         n, rounding, moments.norm.control, moments.largest.control
@@ -185,14 +174,9 @@ def _results_with_control(
     is_kept = (mean_may_be_zero | has_heavy_tails) & np.isfinite(mean.value)
     # A control variate is kept for all combinations of levels or for none.
     dropped = np.broadcast_to(~np.all(is_kept, axis=0), mean.plain.shape)
-    # Tails that the samples show are in their variance already. (NaN, from a trial without
-    # a value, is ignored.)
-    has_unseen_tails = moments.tails > mean.tails
-    unseen_tails = np.where(has_unseen_tails, moments.tails - mean.tails, 0)
-    std_error = np.hypot(results.std_error, unseen_tails)
     return results._replace(
         mean=np.where(dropped, mean.plain, mean.value),
-        std_error=np.where(dropped, plain_spread.std_error, std_error),
+        std_error=np.where(dropped, plain_spread.std_error, results.std_error),
         plain_std_error=plain_spread.std_error,
         plain_s=plain_spread.s,
         variance=np.where(dropped, plain_spread.s**2, results.variance),

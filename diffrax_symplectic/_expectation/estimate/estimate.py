@@ -57,7 +57,7 @@ class Expectation(eqx.Module):
         estimates from files of earlier versions.)
 
     The other fields are what `save` stores beside these, and may change: `moments`,
-    `paths_per_sample`, `rounding_floor`, `tails`, `digests` and `caveat`.
+    `paths_per_sample`, `rounding_floor`, `digests` and `caveat`.
     """
 
     # The moments of batches, with neighbours combined.
@@ -69,9 +69,6 @@ class Expectation(eqx.Module):
     sampling: Any = None
     reason: str = ""
     tol_reached: bool | None = None
-    # For value functions: the mean absolute deviation from the fitted mean in the tails, as
-    # estimated by paths whose noise is wider or pushed to one side.
-    tails: PyTree[np.ndarray] | None = None
     # What the checks of the step could not see, in words.
     caveat: str = ""
     # What tells this estimate from those of other arguments, by the names of these.
@@ -369,7 +366,7 @@ class Expectation(eqx.Module):
     def _results(self, combination: Combination) -> Results:
         """What follows from the moments for one combination of levels."""
         whole = total(self.moments)
-        return results_of(whole, self.rounding_floor, self.tails, combination)
+        return results_of(whole, self.rounding_floor, combination)
 
 
 def _check_file(file: Any, method: str) -> None:

@@ -108,7 +108,6 @@ def header_of(estimate: Any) -> dict[str, Any]:
         "dtypes": jtu.tree_leaves(batch.dtypes),
         "sampling": None if sampling is None else type(sampling).__name__,
         "fields": sampling_fields_as_json,
-        "tails": estimate.tails is not None,
     }
     header |= {name: getattr(estimate, name) for name in _FIELDS_OF_ESTIMATE}
     return header | {"digests": estimate.digests, "caveat": estimate.caveat}
@@ -117,7 +116,7 @@ def header_of(estimate: Any) -> dict[str, Any]:
 def arrays_of(estimate: Any) -> dict[str, np.ndarray]:
     """The arrays of an `Expectation` (whose module imports this one), by their names. For
     example `mean_value_0_1` is leaf 1 of the field `value` of the `mean` of batch 0."""
-    trees = {"tails": estimate.tails}
+    trees = {}
     for batch, moments in enumerate(estimate.moments):
         for name in _AVERAGED:
             for field, tree in getattr(moments, name).fields.items():
@@ -192,7 +191,6 @@ def fields_from(contents: Contents) -> dict[str, Any]:
         "moments": tuple(moments),
         "key_data": arrays["key_data"],
         "sampling": _sampling_from(header),
-        "tails": tree("tails") if header["tails"] else None,
         "ts": arrays["ts"] if "ts" in arrays else None,
     }
 

@@ -6,7 +6,7 @@
   `basis_choice`: which of them.
 - `fits`: value functions, from a pilot run and a loop backward in time.
 - `controlled_paths`: paths, and their control variates.
-- `tails`: trials of what paths too rare to be drawn would add to the error.
+- `mixture`: the laws of the noise of paths, by which rare ones are common.
 
 Axes of arrays, beside those of `_simulation/problem.py`: `C` candidates, among which trials
 choose, `P` polynomials, `K` outcomes of a step. Of random variables there are `n` as well.

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from ..._simulation import (
     Level,
@@ -18,70 +18,63 @@ from ..._simulation import (
 )
 from ..sampling import Averaged, Samples
 from .fits import Choice, FittedFunctions
+from .mixture import log_ratios_of_outcomes, Mixture
 from .noise import Noise
-from .tails import TrialLaw, UsualDeviations
 
 
 class _Control(NamedTuple):
     """The control variate of a path so far.
 
     - `value`: the control variate.
-    - `fitted_mean`: the mean of `phi` by the fitted functions, from the first step on.
-    - `log_ratio`: the log likelihood ratio of the path, as from `Noise.draw`.
+    - `log_ratios`: the logarithm of the probability of the path's noise by each law of a
+        `Mixture`, divided by that by its own law.
     """
 
     value: Float[Array, "S m"]
-    fitted_mean: Float[Array, "S m"]
-    log_ratio: Float[Array, ""]
+    log_ratios: Float[Array, " laws"]
 
 
 def controlled_paths(
     problem: Problem,
     functions: FittedFunctions,
     choice: Choice,
-    usual_deviations: UsualDeviations,
-    law: TrialLaw,
+    mixture: Mixture,
     keys: Key[Array, " n"],
 ) -> Samples:
     """A sample is the value of a path minus its control variate, by `functions` with a
-    leading axis of levels. Deviations beyond the usual ones are averaged apart: trials in
-    which the noise has another `law` estimate them."""
+    leading axis of levels, weighted by the likelihood ratio of a path that draws its noise
+    by a mixture of laws."""
     functions = functions.of_candidates(choice.best)
     starts = jax.vmap(problem.draw_start)(keys)
+    laws = jax.vmap(mixture.draw_law)(keys)
 
     def motion_on(level: Level) -> Motion:
         noise = Noise.of(problem, level)
         u = jtu.tree_map(lambda x: x[level.index], functions)
-        share = law.share[level.index]
-        tilts = law.tilts[level.index]
+        cuts = jnp.asarray(mixture.cuts)[level.index]
+        log_ratios = jnp.asarray(mixture.log_ratios)[level.index]
 
         def step(i, paths):
             second_derivatives = jtu.tree_map(lambda x: x[i], u.second_derivatives)
 
-            def step_of_path(y, solver_state, args, key):
-                x, log_ratio = noise.draw(key, i, share, tilts)
+            def step_of_path(y, solver_state, args, key, law):
+                x, has_outcome = noise.draw(key, i, cuts[law])
                 u_after_step = lambda y1: u(i, y1)
                 path_after = noise.with_args(args).advance(
                     i, y, solver_state, u_after_step, second_derivatives, x
                 )
-                return path_after, log_ratio
+                return path_after, log_ratios_of_outcomes(log_ratios, has_outcome)
 
             states = paths.y, paths.solver_state, paths.args
-            step_taken, log_ratio = jax.vmap(step_of_path)(*states, keys)
+            step_taken, log_ratios_of_step = jax.vmap(step_of_path)(*states, keys, laws)
             # A failed path has no value, but its control must be finite.
             control_of_step = jnp.where(
                 mask_like(step_taken.success, step_taken.control), step_taken.control, 0
             )
-            control_so_far = paths.control
-            # The control of a step is the value after it minus the mean over the step. So
-            # this is the mean over the first step of the functions after it.
-            fitted_mean = jnp.where(
-                i == 0, step_taken.value - control_of_step, control_so_far.fitted_mean
-            )
+            so_far = paths.control
             control = _Control(
-                value=control_so_far.value + jnp.where(choice.used, control_of_step, 0),
-                fitted_mean=fitted_mean,
-                log_ratio=control_so_far.log_ratio + log_ratio,
+                value=so_far.value + jnp.where(choice.used, control_of_step, 0),
+                log_ratios=so_far.log_ratios + log_ratios_of_step,
             )
             return paths.after_step(
                 problem,
@@ -96,46 +89,64 @@ def controlled_paths(
 
         dtype = jax.eval_shape(lambda: u(0, problem.y0)).dtype
         zero = jnp.zeros((len(keys), *problem.output_shape), dtype)
-        no_control = _Control(zero, zero, jnp.zeros(len(keys), dtype))
+        no_control = _Control(zero, jnp.zeros((len(keys), len(log_ratios)), dtype))
         solver_state = jax.vmap(first_solver_state)(*starts)
         return Motion(step, PathStates.start(problem, starts, solver_state, no_control))
 
     simulated = simulate(problem, motion_on)
-    return _samples_of(problem, choice, usual_deviations, simulated)
+    return _samples_of(problem, mixture, laws, simulated)
 
 
 def _samples_of(
     problem: Problem,
-    choice: Choice,
-    usual_deviations: UsualDeviations,
+    mixture: Mixture,
+    laws: Int[Array, " n"],
     simulated: Simulated,
 ) -> Samples:
-    """The samples from simulated paths, whose `control` is a `_Control`."""
+    """The samples from simulated paths, which drew their noise by `laws` of the mixture,
+    and whose `control` is a `_Control`."""
     # (levels, S, n, m)
     plain = simulated.saved
     # From (levels, n, S, m) to the same.
     control = jnp.swapaxes(simulated.control.value, 1, 2).astype(plain.dtype)
-    fitted_mean = jnp.swapaxes(simulated.control.fitted_mean, 1, 2).astype(plain.dtype)
-    # At the start itself nothing is random, and no function is fitted.
-    is_at_start = mask_like(problem.levels.saved_steps[0] == 0, plain[0])
-    fitted_mean = jnp.where(is_at_start, plain, fitted_mean)
     # (combinations, S, n, m)
     value = problem.combinations(plain - control)
     plain = problem.combinations(plain)
-    control = problem.combinations(control)
-    fitted_mean = problem.combinations(fitted_mean)
 
-    center = usual_deviations.center[:, :, None]
-    mean = jnp.where(choice.used[:, None], fitted_mean, center)
-    deviations = jnp.abs(value - mean)
     # The random variables of all levels are drawn independently, so ratios are multiplied.
-    log_ratio = jnp.sum(simulated.control.log_ratio, axis=0)
-    tails = usual_deviations.deviations_beyond(deviations, plain, log_ratio)
+    weights = mixture.weights(jnp.sum(simulated.control.log_ratios, axis=0))
+    # A path that fails by another law is rare by its own, of which other paths tell. It
+    # counts as one without a deviation.
+    has_failed = jnp.any(simulated.failed, axis=0)
+    has_own_law = laws == 0
+    weights = jnp.where(has_failed, 0, weights).astype(plain.dtype)
+    value = _weighted(weights, value)
+    plain = _weighted(weights, plain)
     averaged = Averaged(
         problem.unravel_samples(value),
         plain=problem.unravel_samples(plain),
-        control=problem.unravel_samples(control),
-        tails=problem.unravel_samples(tails),
+        control=problem.unravel_samples(plain - value),
     )
-    good = ~jnp.any(simulated.failed, axis=0)
-    return Samples(averaged, good, num_failed=simulated.failed)
+    return Samples(
+        averaged,
+        good=~(has_failed & has_own_law),
+        num_failed=simulated.failed & has_own_law,
+    )
+
+
+def _weighted(
+    weights: Float[Array, " n"], value: Float[Array, "combinations S n m"]
+) -> Float[Array, "combinations S n m"]:
+    """Values of which the mean is that of the weighted ones. The values of paths without
+    weight, which may have failed, do not matter."""
+    weights = weights[:, None]
+    shares = weights / jnp.sum(weights)
+    weighted = jnp.where(shares > 0, shares * value, 0)
+    mean_of_others = (jnp.sum(weighted, axis=2, keepdims=True) - weighted) / (
+        1 - shares
+    )
+    mean_of_others = jnp.where(shares < 1, mean_of_others, 0)
+    # The mean of a weight is one, and independent of the other paths. So only deviations
+    # from their mean are weighted, which vary less.
+    deviations = jnp.where(weights > 0, weights * (value - mean_of_others), 0)
+    return mean_of_others + deviations

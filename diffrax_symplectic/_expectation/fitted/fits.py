@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 from ..._custom_types import Y
 from ..._simulation import PathStates, Problem, ravel
 from .bases import AbstractBasis, equal_weights, Target
-from .noise import Noise
+from .noise import cuts_by, cuts_of, Noise
 
 
 # The number of states over which second derivatives along the noise are averaged. A rough
@@ -33,6 +33,12 @@ class Choice(NamedTuple):
 
     best: Int[Array | np.ndarray, "S m"]
     used: Bool[Array | np.ndarray, "S m"]
+
+    @staticmethod
+    def of_all(candidate: int, output_shape: tuple[int, int]) -> "Choice":
+        """The same candidate for all."""
+        best = np.full(output_shape, candidate)
+        return Choice(best, np.ones(output_shape, bool))
 
 
 class FittedFunctions(eqx.Module):
@@ -145,7 +151,7 @@ def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
         x = None
         if key is not None:
             # The pilot's own steps draw by the indices below `most_steps`.
-            x, _ = noise.draw(key, problem.most_steps + i)
+            x, _ = noise.draw(key, problem.most_steps + i, cuts_of(noise.laws))
         mean = noise.mean(next_step, y, lambda y1: fitted(next_step, y1), x)
         phi = problem.values(problem.t0 + (i + 1) * level.h, y).astype(mean.dtype)
         # Which of the times at which to average are the end of this step, or later.
@@ -196,13 +202,16 @@ class _Pilot(NamedTuple):
 def _run_pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
     """Simulates a path for each key."""
     problem = noise.problem
+    # With equal probabilities of all outcomes the pilot's paths spread further than others,
+    # so that the fit also holds for outliers.
+    equal_cuts = cuts_by(
+        [np.full_like(x.values, 1 / len(x.values)) for x in noise.laws]
+    )
 
     def step_one(
         i: Any, y: Y, args: PyTree[Array], key: PRNGKeyArray
     ) -> tuple[Y, Bool[Array, ""]]:
-        # With equal probabilities of all outcomes the pilot's paths spread further than
-        # others, so that the fit also holds for outliers.
-        x, _ = noise.draw(key, i, share=jnp.ones(()))
+        x, _ = noise.draw(key, i, equal_cuts)
         noise_of_path = noise.with_args(args)
         solver_state = noise_of_path.new_solver_state(i, y)
         y, _, success = noise_of_path.step(i, y, solver_state, x)

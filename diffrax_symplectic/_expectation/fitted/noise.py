@@ -1,9 +1,8 @@
 """The random variables of a step, and expectations over them."""
 
 import dataclasses
-import functools as ft
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
@@ -11,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree, UInt32
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree, UInt32
 
 from ..._brownian import Discrete, random_words
 from ..._custom_types import Y
@@ -45,14 +44,12 @@ class StepOfPath(NamedTuple):
 
     - `y`, `solver_state`: the states of the path and of the solver.
     - `success`: whether the step succeeded.
-    - `value`: the value of the function at the end.
     - `control`: its control variate, whose mean over the step's random variables is zero.
     """
 
     y: Y
     solver_state: PyTree[Array]
     success: Bool[Array, ""]
-    value: Array
     control: Array
 
 
@@ -102,31 +99,20 @@ class Noise(eqx.Module):
         self,
         key: PRNGKeyArray,
         draw_index: Any,
-        share: ArrayLike = 0.0,
-        tilt: ArrayLike = 0.0,
-    ) -> tuple[Float[Array, " n"], Float[Array, ""]]:
-        """The variables `x` drawn from the key and this index, and their log likelihood
-        ratio: the logarithm of the probability of `x` by the law that it is drawn by,
-        divided by its probability by the variables' own law. In a fraction `share` (from 0
-        to 1) of draws all outcomes are equally probable. Probabilities are multiplied by
-        the exponential of `tilt`, a number or one for each variable, times the outcome."""
+        cuts: UInt32[Array | np.ndarray, "n outcomes-1"],
+    ) -> tuple[Float[Array, " n"], Bool[Array, "n outcomes"]]:
+        """The variables `x` drawn from the key and this index, and which outcomes they
+        have. The number of the outcome of a variable is the number of its `cuts`, as from
+        `cuts_of`, that are not above its random word."""
         place = draw_index, jnp.asarray(self.level.index)
         # One random word for each variable, from a single block of words.
         words = random_words(key, place, 1, len(self.laws))[0]
-        x = jnp.zeros(len(self.laws), self.problem.dtype)
-        log_ratios = jnp.zeros_like(x)
-        tilts = jnp.broadcast_to(tilt, x.shape)
-        # Outcomes are drawn once for each different law, rather than for each variable:
-        # hundreds of variables have one law or two.
-        for law in dict.fromkeys(self.laws):
-            has_law = np.array([other == law for other in self.laws])
-            # As if all variables had this law.
-            x_by_law, log_ratios_by_law = _draw_outcomes(
-                law, words, share, tilts, x.dtype
-            )
-            x = jnp.where(has_law, x_by_law, x)
-            log_ratios = jnp.where(has_law, log_ratios_by_law, log_ratios)
-        return x, jnp.sum(log_ratios)
+        numbers = jnp.sum(words[:, None] >= cuts, axis=1)
+        values = padded([np.array(law.values) for law in self.laws])
+        _, num_outcomes = values.shape
+        has_outcome = numbers[:, None] == np.arange(num_outcomes)
+        values = values.astype(self.problem.dtype)
+        return jnp.sum(jnp.where(has_outcome, values, 0), axis=1), has_outcome
 
     def weighted_nodes(self, x: Array | None = None) -> WeightedNodes:
         """Nodes and weights of the expectation over the variables: all outcomes and their
@@ -191,7 +177,6 @@ class Noise(eqx.Module):
             y=y1,
             solver_state=solver_state_after,
             success=jnp.all(success),
-            value=value,
             control=value - mean,
         )
 
@@ -221,7 +206,6 @@ class Noise(eqx.Module):
             y=y1,
             solver_state=solver_state_after,
             success=success,
-            value=u(y1),
             control=linear + quadratic,
         )
 
@@ -279,48 +263,31 @@ def _hidden_if_result(x: Array) -> Array:
     return jax.lax.optimization_barrier(x) if is_result else x
 
 
-def _draw_outcomes(
-    law: Discrete,
-    words: UInt32[Array, " n"],
-    share: ArrayLike,
-    tilts: Float[Array, " n"],
-    dtype: Any,
-) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
-    """Outcomes of variables with one law, widened and tilted, and their log likelihood
-    ratios, from one random word each."""
-    own_probabilities = np.array(law.probabilities, dtype)
-    widened = widened_probabilities(law, share)
-    # (variables, outcomes)
-    probabilities = jax.vmap(ft.partial(tilted_probabilities, law, widened))(tilts)
-    # A variable has the outcome whose index is the number of cuts that are not above its
-    # word. The law as it is has cuts in integers, by which a `WeakBrownianPath` draws, too.
-    # With other cuts, by rounded probabilities, few draws would differ, but the law would
-    # not be exact.
-    is_unchanged = (share == 0) & (tilts == 0)
-    # Words are whole numbers from 0 to `2**32 - 1`.
-    cuts = (jnp.cumsum(probabilities, axis=1)[:, :-1] * 2.0**32).astype(jnp.uint32)
-    cuts = jnp.where(is_unchanged[:, None], np.array(law.cuts, np.uint32), cuts)
-    indices = jnp.sum(words[:, None] >= cuts, axis=1)
-    drawn = jnp.asarray(law.values, dtype)[indices]
-    log_ratios_of_outcomes = jnp.log(probabilities / own_probabilities)
-    log_ratios = jnp.take_along_axis(log_ratios_of_outcomes, indices[:, None], axis=1)
-    return drawn, log_ratios[:, 0]
+def cuts_of(laws: Sequence[Discrete]) -> UInt32[np.ndarray, "n outcomes-1"]:
+    """The cuts between the random words of the outcomes of variables with these laws, by
+    which a `WeakBrownianPath` draws, too."""
+    return _padded_cuts([np.array(law.cuts, float) for law in laws])
 
 
-def widened_probabilities(law: Discrete, share: Any) -> Any:
-    """Probabilities between those of the law (for a `share` of zero) and equal ones (for
-    one)."""
-    own = np.array(law.probabilities, jnp.result_type(share))
-    return (1 - share) * own + share / len(own)
+def cuts_by(
+    probabilities: Sequence[Float[np.ndarray, " outcomes"]],
+) -> UInt32[np.ndarray, "n outcomes-1"]:
+    """The cuts for the probabilities of the outcomes of each variable."""
+    return _padded_cuts([np.cumsum(p)[:-1] * 2.0**32 for p in probabilities])
 
 
-def tilted_probabilities(law: Discrete, probabilities: Any, tilt: Any) -> Any:
-    """The probabilities times the exponential of `tilt` times the outcome, normalized."""
-    # Numbers stay on the host: trials of tails call this hundreds of times.
-    numpy = jnp if isinstance(tilt, jax.Array) else np
-    values = np.array(law.values, jnp.result_type(tilt))
-    weights = probabilities * numpy.exp(tilt * values)
-    return weights / numpy.sum(weights)
+def _padded_cuts(rows: Sequence[np.ndarray]) -> UInt32[np.ndarray, "n outcomes-1"]:
+    most = max(map(len, rows))
+    # Words are whole numbers, and none is above this one.
+    last = np.iinfo(np.uint32).max
+    cuts = [np.pad(x, (0, most - len(x)), constant_values=last) for x in rows]
+    return np.minimum(np.stack(cuts), last).astype(np.uint32)
+
+
+def padded(rows: Sequence[np.ndarray]) -> np.ndarray:
+    """The rows as one array, each with its last entry in place of those that it lacks."""
+    most = max(map(len, rows))
+    return np.stack([np.pad(row, (0, most - len(row)), mode="edge") for row in rows])
 
 
 def count_outcomes(problem: Problem) -> int | None:

@@ -19,12 +19,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from ..._arguments import check_memory, check_untraced, whole_number
-from ..._custom_types import Devices
 from ..._lapack import lapack_in_turn
 from ..._programs import compiled
 from ..._simulation import Combination, halved, Problem
 from ..._solver import without_newton
-from ..estimate import combined_results, Expectation, total
+from ..estimate import combined_results, Expectation
 from ..run import run
 from ..sampling import (
     AbstractSampling,
@@ -37,8 +36,8 @@ from .bases import AbstractBasis
 from .basis_choice import chosen_basis, is_quick, warn_of_long_fit
 from .controlled_paths import controlled_paths
 from .fits import Choice, fit, FittedFunctions
+from .mixture import Mixture
 from .noise import Noise
-from .tails import largest_tails, laws_of_trials, TrialLaw, UsualDeviations
 
 
 # Folded into the key of a call to draw trials. (Numbers of levels, which are folded into it
@@ -46,9 +45,6 @@ from .tails import largest_tails, laws_of_trials, TrialLaw, UsualDeviations
 _TRIAL_KEY = 0xFFFFFFFE
 # From the code that calls `expectation` to `prepare`, counted as for `warnings.warn`.
 _FRAMES_TO_USER = 5
-# A trial of the tails has this many batches, more than the trial of one batch beyond whose
-# deviations it looks.
-_BATCHES_OF_TAIL_TRIAL = 2
 
 
 @saved_by_name
@@ -100,44 +96,47 @@ class ValueFunctions(AbstractSampling):
         warn_of_long_fit(chosen, stacklevel=_FRAMES_TO_USER)
         basis = chosen.basis
         struct = problem.sample_struct
-        controlled = _ControlledSampling(
-            problem,
-            _fits(problem, key, basis, range(len(problem.levels.h))),
-            output_shape=problem.output_shape,
-            struct=Averaged(struct, plain=struct, control=struct, tails=struct),
-            trial_key=jr.fold_in(key, _TRIAL_KEY),
-            devices=devices,
-            batch_size=self.batch_size,
-        )
-        own_law, *other_laws = laws_of_trials(problem)
-        # One trial for each candidate, on the same paths.
-        trials_of_candidates = [
-            controlled.trial_of_candidate(candidate, own_law)
-            for candidate in range(len(basis.candidates))
-        ]
+        functions = _fits(problem, key, basis, range(len(problem.levels.h)))
+        mixture = Mixture.of(problem)
+
+        def plan_for(
+            choice: Choice, mixture: Mixture, num_samples: int
+        ) -> SamplingPlan:
+            # A `Partial` is a PyTree: a program is compiled once for all arrays in it.
+            sampler = jtu.Partial(controlled_paths, problem, functions, choice, mixture)
+            return SamplingPlan(
+                sampler,
+                num_samples=num_samples,
+                batch_size=self.batch_size,
+                levels=len(problem.levels.h),
+                struct=Averaged(struct, plain=struct, control=struct),
+                # These few paths take less time than compiling their program.
+                is_quick=True,
+            )
+
+        # One trial for each candidate, on the same paths, which are not part of the
+        # estimate.
+        key_of_trials = jr.fold_in(key, _TRIAL_KEY)
+        trials_of_candidates = []
+        for candidate in range(len(basis.candidates)):
+            same_for_all = Choice.of_all(candidate, problem.output_shape)
+            plan = plan_for(same_for_all, mixture, self.batch_size)
+            trials_of_candidates.append(run(plan, key_of_trials, devices))
         comparison = _comparison(trials_of_candidates, problem.output_shape)
         choice = comparison.choice
+        if self.degree == 0:
+            choice = choice._replace(used=np.zeros_like(choice.used))
         if self.degree and not np.any(choice.used):
             warnings.warn(
                 f"`degree={self.degree}` is no better than no control variate, so none is "
                 "used. Pass another `degree`, or another `sampling`.",
                 stacklevel=_FRAMES_TO_USER,
             )
-        # Trials with stronger noise estimate the deviations beyond the largest in these.
-        usual_deviations = _usual_deviations(
-            trials_of_candidates, choice, problem.output_shape, problem.dtype
-        )
-        tail_trials = [
-            controlled.trial(
-                choice, usual_deviations, law, _BATCHES_OF_TAIL_TRIAL * self.batch_size
-            )
-            for law in other_laws
-        ]
-        plan = controlled.plan(choice, usual_deviations, own_law, self.num_paths)
-        return plan._replace(
+        if not np.any(choice.used):
+            mixture = mixture.own_law_alone()
+        return plan_for(choice, mixture, self.num_paths)._replace(
             is_fit_quick=is_quick(chosen),
             reason=_reason(basis, choice),
-            tails=largest_tails(tail_trials),
             remainder=comparison.remainder(problem.dtype),
         )
 
@@ -152,88 +151,16 @@ def with_half_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
     known_functions = jtu.tree_map(lambda x: x[1:], functions)
     finer_functions = _joined([known_functions, last_functions])
     sampler = jtu.Partial(controlled_paths, finer_problem, finer_functions, *others)
-    return plan._replace(sampler=sampler, tails=None)
-
-
-class _ControlledSampling(NamedTuple):
-    """What the trials and the estimate share: paths with control variates.
-
-    - `output_shape`: as in `Problem`.
-    - `struct`: as in `SamplingPlan`.
-    - `trial_key`: the random key of all trials, whose paths are not part of the estimate.
-    """
-
-    problem: Problem
-    functions: FittedFunctions
-    output_shape: tuple[int, int]
-    struct: Averaged
-    trial_key: PRNGKeyArray
-    devices: Devices
-    batch_size: int
-
-    def plan(
-        self,
-        choice: Choice,
-        usual_deviations: UsualDeviations,
-        law: TrialLaw,
-        num_samples: int,
-    ) -> SamplingPlan:
-        """The plan for paths whose noise has this law."""
-        # A `Partial` is a PyTree: a program is compiled once for all arrays in it.
-        sampler = jtu.Partial(
-            controlled_paths,
-            self.problem,
-            self.functions,
-            choice,
-            usual_deviations,
-            law,
-        )
-        return SamplingPlan(
-            sampler,
-            num_samples=num_samples,
-            batch_size=self.batch_size,
-            levels=len(self.problem.levels.h),
-            struct=self.struct,
-            # These few paths take less time than compiling their program.
-            is_quick=True,
-        )
-
-    def trial(
-        self,
-        choice: Choice,
-        usual_deviations: UsualDeviations,
-        law: TrialLaw,
-        num_samples: int,
-    ) -> Expectation:
-        """An estimate from this number of paths, which are not part of the result."""
-        plan = self.plan(choice, usual_deviations, law, num_samples)
-        return run(plan, self.trial_key, self.devices)
-
-    def trial_of_candidate(self, candidate: int, law: TrialLaw) -> Expectation:
-        """A trial of one batch, with the same candidate for all components."""
-        choice = Choice(
-            best=np.full(self.output_shape, candidate),
-            used=np.ones(self.output_shape, bool),
-        )
-        # The same program estimates tails, but nothing deviates by more than infinity.
-        shape = len(self.problem.weights), *self.output_shape
-        dtype = self.problem.dtype
-        no_tails = UsualDeviations(
-            center=np.zeros(shape, dtype), largest=np.full(shape, np.inf, dtype)
-        )
-        return self.trial(choice, no_tails, law, self.batch_size)
+    return plan._replace(sampler=sampler)
 
 
 def _as_one_array(
-    tree: PyTree[np.ndarray | np.floating],
-    output_shape: tuple[int, int],
-    *leading_axes: int,
-) -> np.ndarray:
-    """The arrays of a PyTree in the structure of `phi` as one array of shape
-    `(*leading_axes, S, m)`, where `output_shape` is `(S, m)`."""
+    tree: PyTree[np.ndarray | np.floating], output_shape: tuple[int, int]
+) -> Float[np.ndarray, "S m"]:
+    """The arrays of a PyTree in the structure of `phi` as one array of the shape `(S, m)`
+    of `Problem.output_shape`."""
     num_times, _ = output_shape
-    shape = *leading_axes, num_times, -1
-    leaves = [np.reshape(leaf, shape) for leaf in jtu.tree_leaves(tree)]
+    leaves = [np.reshape(leaf, (num_times, -1)) for leaf in jtu.tree_leaves(tree)]
     return np.concatenate(leaves, axis=-1)
 
 
@@ -284,34 +211,6 @@ def _comparison(
         plain_errors=plain_errors,
         mean=_as_one_array(first.mean, output_shape),
     )
-
-
-def _usual_deviations(
-    trials_of_candidates: list[Expectation],
-    choice: Choice,
-    output_shape: tuple[int, int],
-    dtype: Any,
-) -> UsualDeviations:
-    """The mean without control and the largest deviations in the trials: for each component
-    those with its best candidate, or without control."""
-    moments_of_trials = [total(trial.moments) for trial in trials_of_candidates]
-    first, *_ = moments_of_trials
-    num_combinations, *_ = jtu.tree_leaves(first.mean.value)[0].shape
-
-    def as_one_array(tree: PyTree[np.ndarray]) -> np.ndarray:
-        return _as_one_array(tree, output_shape, num_combinations)
-
-    # The trials have the same paths, so without control their results are the same.
-    center = as_one_array(first.mean.plain)
-    largest_plain = as_one_array(first.largest.plain)
-    # (C, combinations, S, m)
-    largest_with_candidates = np.stack(
-        [as_one_array(moments.largest.value) for moments in moments_of_trials]
-    )
-    best = np.asarray(choice.best)[None, None]
-    largest_with_best = np.take_along_axis(largest_with_candidates, best, 0)[0]
-    largest = np.where(choice.used, largest_with_best, largest_plain)
-    return UsualDeviations(center.astype(dtype), largest.astype(dtype))
 
 
 def _reason(basis: AbstractBasis, choice: Choice) -> str:
