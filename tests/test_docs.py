@@ -104,7 +104,7 @@ def test_tables_of_solvers_are_up_to_date(tables):
 
 
 def test_notebooks_are_made_from_their_scripts():
-    assert len(SCRIPTS) == 7
+    assert len(SCRIPTS) == 4
     folder = ROOT / "docs" / "examples"
     assert {p.stem for p in folder.glob("*.ipynb")} == {p.stem for p in SCRIPTS}
     for script in SCRIPTS:

@@ -10,8 +10,8 @@ Strong errors are root mean squares over one set of Brownian paths, by `compare_
 The first measures these, in a quarter of an hour of processor time on however busy a
 machine. The second measures costs, and wants a quiet one: CPU seconds per path, in batches
 of 10,000, in turns after all programs are compiled. What was measured is kept in
-`docs/benchmarks/work_precision.json`, from which all three write `work_precision.md` and
-its pictures.
+`docs/benchmarks/work_precision.json`, from which all three write their part of
+`docs/benchmarks/index.md` and its pictures.
 """
 
 import functools as ft
@@ -39,7 +39,7 @@ from .._orders import (
 )
 from .._pictures import style, WIDTH
 from ._exact import two_noises_square
-from ._timing import DOCS, ensemble, keys, machine
+from ._timing import DOCS, ensemble, keys, machine, table, write
 
 
 KEPT = DOCS / "work_precision.json"
@@ -299,9 +299,9 @@ def draw(kind: str, kept: dict) -> None:
     plt.close(figure)
 
 
-def rows(kind: str, model: str, kept: dict) -> list[str]:
+def rows(kind: str, model: str, kept: dict) -> list[tuple[str, ...]]:
     """Of the table."""
-    lines = []
+    out = []
     system = model
     for name, fields in kept["errors"][kind][model].items():
         e = Errors._make(np.array(fields))
@@ -309,39 +309,34 @@ def rows(kind: str, model: str, kept: dict) -> list[str]:
         error, own = e.errors[SHOWN], e.std_errors[SHOWN]
         bar = f" ± {own:.0e}" if own > error / 10 else ""
         if name != "StratonovichMilstein":  # the picture has it
-            cells = system, name, f"{error:.1e}{bar}", f"{seconds * 1e6:.2f}"
-            lines.append(f"| {' | '.join(cells)} |".replace("|  |", "| |"))
+            out.append((system, name, f"{error:.1e}{bar}", f"{seconds * 1e6:.2f}"))
             system = ""  # only in the first row of a system
-    return lines
+    return out
 
 
 EXPLAINED = {
-    "weak": f"Errors at $h = 1/{1 / HS[SHOWN]:g}$, exact for linear models, else from "
-    "`ArrayRQMC`.",
-    "strong": f"Root mean squares over 500 Brownian paths at $h = 1/{1 / HS[1 + SHOWN]:g}$ "
-    "(`compare_solvers`).",
+    "weak": f"Weak errors at $h = 1/{1 / HS[SHOWN]:g}$, exact for linear models, else from "
+    "`ArrayRQMC`:",
+    "strong": "Strong errors, root mean squares over 500 Brownian paths at "
+    f"$h = 1/{1 / HS[1 + SHOWN]:g}$ (`compare_solvers`):",
 }
-HEAD = "| system | solver | error | µs |", "|---" * 4 + "|"
 
 
-def write(kept: dict) -> None:
+def write_page(kept: dict) -> None:
     lines = [
-        "# Speed against accuracy",
-        "",
         Path(__file__).with_suffix(".md").read_text().strip(),
         "",
         "Bars: three standard errors; points not clear of zero are omitted. CPU time per "
-        f"path, one core, batches of 10,000. {kept['machine']}. Made by `python -m "
-        "examples.benchmarks.work_precision`.",
+        f"path, one core, batches of 10,000. {kept['machine']}.",
     ]
     for kind in ERRORS:
         draw(kind, kept)
-        title = f"{kind.title()} errors"
-        picture = f"![{title} against CPU seconds per path](work_precision_{kind}.png)"
-        lines += ["", f"## {title}", "", picture, "", EXPLAINED[kind], "", *HEAD]
-        for model in STRONG:
-            lines += rows(kind, model, kept)
-    (DOCS / "work_precision.md").write_text("\n".join(lines) + "\n")
+        title = f"{kind.title()} errors against CPU seconds per path"
+        picture = f"![{title}](work_precision_{kind}.png)"
+        cells = [row for model in STRONG for row in rows(kind, model, kept)]
+        shown = table(("system", "solver", "error", "µs"), cells)
+        lines += ["", picture, "", EXPLAINED[kind], "", *shown]
+    write("examples.benchmarks.work_precision", lines)
 
 
 def main(*kinds: str) -> None:
@@ -354,7 +349,7 @@ def main(*kinds: str) -> None:
         kept["machine"] = machine()
     if kinds:
         KEPT.write_text(json.dumps(kept, indent=1) + "\n")
-    write(kept)
+    write_page(kept)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ import diffrax_symplectic as ds
 from examples.hard_cases import (
     double_well,
     learning,
-    nls,
     rods,
     two_body,
 )
@@ -127,18 +126,6 @@ def test_double_well_with_friction_has_nearly_the_moments_of_gibbs():
     step = double_well.LANGEVIN["BAOAB"][0]._replace(make_terms=cold)
     [[q2, _]] = stationary_bias(step, V, 0.1, [h])
     assert abs(q2) <= 1e-3
-
-
-def test_schroedinger_lattice_keeps_its_norm_and_gains_the_energy_of_the_noise():
-    ours, heun = (
-        nls.lattice(nls.SOLVERS[name], 0.02, 1.0, 8, 0.1, n=128)
-        for name in ("ImplicitMidpoint", "Heun")
-    )
-    assert ours.failed == heun.failed == 0
-    assert ours.norm_error <= 1e-13
-    assert abs(ours.balance.sigmas) <= 4
-    # Heun multiplies the highest modes, of frequency 32, in each step.
-    assert heun.norm_error > 1e-3
 
 
 def test_the_law_of_rods_is_the_volume_of_the_momenta_that_they_allow():
