@@ -49,6 +49,8 @@ H, STEPS = 1 / 64, 16
 HS = [2.0**-k for k in range(1, 8)]
 # Which one the table shows. Strong errors begin with the second step size.
 SHOWN = 3
+# The pictures have these, too.
+OMITTED = "StratonovichMilstein", "SRKs1", "SRKs3", "SRKw2", "SRKw3a", "SRKw3c"
 
 Weak = lambda shape, **kwargs: lambda key: ds.WeakBrownianPath(shape, key, **kwargs)
 Gaussian = lambda shape: lambda key: ds.FixedStepBrownianPath(shape, key)
@@ -308,7 +310,7 @@ def rows(kind: str, model: str, kept: dict) -> list[tuple[str, ...]]:
         seconds = kept["seconds"][kind][model][name] / e.hs[SHOWN]
         error, own = e.errors[SHOWN], e.std_errors[SHOWN]
         bar = f" ± {own:.0e}" if own > error / 10 else ""
-        if name != "StratonovichMilstein":  # the picture has it
+        if name not in OMITTED:
             out.append((system, name, f"{error:.1e}{bar}", f"{seconds * 1e6:.2f}"))
             system = ""  # only in the first row of a system
     return out

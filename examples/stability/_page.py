@@ -58,8 +58,8 @@ def fill(module: str, **values) -> str:
 
 
 def run(name: str, description: str | None, modules: Sequence[str]) -> None:
-    """The command that makes a page: the text of `page.md` next to the modules, and a
-    section of each. They are imported here, for they use JAX."""
+    """The command that makes a page: the text of `page.md` next to the modules, a section
+    of each, and the text of `tail.md`. They are imported here, for they use JAX."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument(
         "--quick",
@@ -81,5 +81,6 @@ def run(name: str, description: str | None, modules: Sequence[str]) -> None:
         source = importlib.import_module(f"examples.{name}.{module}")
         sections.append(source.section(page))
         print(f"({time.perf_counter() - begin:.0f} seconds)", flush=True)
-    page.write(sections)
+    tail = ROOT / "examples" / name / "tail.md"
+    page.write([*sections, tail.read_text()] if tail.exists() else sections)
     print(f"\nAll done in {time.perf_counter() - start:.0f} seconds.")
