@@ -301,19 +301,17 @@ def draw(kind: str, kept: dict) -> None:
     plt.close(figure)
 
 
-def rows(kind: str, model: str, kept: dict) -> list[tuple[str, ...]]:
-    """Of the table."""
+def cell(kind: str, model: str, kept: dict) -> str:
+    """Errors and microseconds of all solvers."""
     out = []
-    system = model
     for name, fields in kept["errors"][kind][model].items():
         e = Errors._make(np.array(fields))
-        seconds = kept["seconds"][kind][model][name] / e.hs[SHOWN]
+        micro = kept["seconds"][kind][model][name] / e.hs[SHOWN] * 1e6
         error, own = e.errors[SHOWN], e.std_errors[SHOWN]
         bar = f" ± {own:.0e}" if own > error / 10 else ""
         if name not in OMITTED:
-            out.append((system, name, f"{error:.1e}{bar}", f"{seconds * 1e6:.2f}"))
-            system = ""  # only in the first row of a system
-    return out
+            out.append(f"{name} {error:.1e}{bar} ({micro:.2f})")
+    return ", ".join(out)
 
 
 EXPLAINED = {
@@ -335,8 +333,8 @@ def write_page(kept: dict) -> None:
         draw(kind, kept)
         title = f"{kind.title()} errors against CPU seconds per path"
         picture = f"![{title}](work_precision_{kind}.png)"
-        cells = [row for model in STRONG for row in rows(kind, model, kept)]
-        shown = table(("system", "solver", "error", "µs"), cells)
+        cells = [(model, cell(kind, model, kept)) for model in STRONG]
+        shown = table(("system", "error of each solver (µs per path)"), cells)
         lines += ["", picture, "", EXPLAINED[kind], "", *shown]
     write("examples.benchmarks.work_precision", lines)
 

@@ -67,14 +67,13 @@ SEPARABLE = {
     "SRKs3": Case(ds.SRKs3(), weak, _SEPARABLE),
     "SRKw4": Case(ds.SRKw4(), weak, _SEPARABLE),
 }
-DIFFRAX = {
+EXPLICIT = {
     "Heun": Case(diffrax.Heun(), gaussian),
     "EulerHeun": Case(diffrax.EulerHeun(), gaussian),
     "SlowRK": Case(diffrax.SlowRK(), areas),
+    # For an Ito equation: where the noise is not additive it gets the corrected drift.
+    "Euler": Case(diffrax.Euler(), gaussian),
 }
-# For an Ito equation: where the noise is not additive it gets the corrected drift.
-EULER = Case(diffrax.Euler(), gaussian)
-EXPLICIT = {**DIFFRAX, "Euler": EULER}
 
 # Noise Hamiltonians of an oscillator with H0 = (p^2 + q^2) / 2, before the factor s.
 NOISE = {

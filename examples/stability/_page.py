@@ -52,6 +52,14 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
 
 
+def merged(rows: Iterable[Sequence[str]]) -> list[Sequence[str]]:
+    """The rows, one for all names that have the same cells."""
+    names: dict[tuple[str, ...], list[str]] = {}
+    for name, *cells in rows:
+        names.setdefault(tuple(cells), []).append(name)
+    return [(", ".join(same), *cells) for cells, same in names.items()]
+
+
 def fill(module: str, **values) -> str:
     """The text next to a module, with what was measured put in the braces."""
     return Path(module).with_suffix(".md").read_text().format(**values)
