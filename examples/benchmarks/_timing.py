@@ -19,9 +19,9 @@ jax.config.update("jax_enable_x64", True)
 DOCS = Path(__file__).parents[2] / "docs" / "benchmarks"
 
 
-def write(module: str, lines: Iterable[str]) -> None:
+def write(module: str, lines: Iterable[str], page: Path = DOCS / "index.md") -> None:
     """Puts the lines into the part of the page that a module makes."""
-    page, head = DOCS / "index.md", f"<!-- made by {module} -->"
+    head = f"<!-- made by {module} -->"
     part = re.compile(f"{re.escape(head)}.*?<!-- end -->", re.DOTALL)
     text = "\n".join([head, "", *lines, "", "<!-- end -->"])
     page.write_text(part.sub(lambda _: text, page.read_text()))

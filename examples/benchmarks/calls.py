@@ -76,14 +76,6 @@ def expectation(solver: Any, **arguments: Any) -> Callable:
     return lambda i: ds.expectation(*problem, key=jr.key(i), **arguments)
 
 
-def ensemble(engine: str) -> Callable:
-    terms, solver = pendulum(()), ds.ImplicitMidpoint()
-    problem = (terms, solver, 0.0, STEPS * H, H, Y0)
-    return lambda i: ds.ensemble(
-        *problem, key=jr.key(i), num_paths=PATHS, engine=engine
-    )
-
-
 FEW = ds.IndependentPaths(PATHS)
 SOLVERS = (ds.StormerVerlet(), ds.ImplicitMidpoint(), ds.StrangGauss())
 DEFAULTS = {
@@ -96,7 +88,7 @@ SOLVES = {
     f"jitted `diffeqsolve`, `{type(solver).__name__}`": (
         lambda solver=solver: solved_by(solver)
     )
-    for solver in (ds.ImplicitMidpoint(), ds.StrangGauss(), ds.SRKw2())
+    for solver in (ds.ImplicitMidpoint(), ds.StrangGauss())
 }
 HEUN = "jitted `diffeqsolve`, `Heun`"
 CALLS: dict[str, Callable[[], Callable]] = {
@@ -111,8 +103,6 @@ CALLS: dict[str, Callable[[], Callable]] = {
             ds.ImplicitMidpoint(), sampling=FEW, levels=1, engine="drjit"
         )
     ),
-    f"`ensemble` of {PATHS} paths": lambda: ensemble("jax"),
-    f'`ensemble` of {PATHS} paths, `engine="drjit"`': lambda: ensemble("drjit"),
 }
 
 

@@ -81,8 +81,6 @@ SOLVERS = {
         ds.ImplicitMidpoint(),
         ds.ImplicitMidpoint().path,
     ),
-    "SRKs1": (ds.SRKs1(), ds.WeakBrownianPath),
-    "SRKw1": (ds.SRKw1(), ds.WeakBrownianPath),
     "SRKw2": (ds.SRKw2(), ds.WeakBrownianPath),
     "StrangGauss": (ds.StrangGauss(), ds.WeakBrownianPath),
 }

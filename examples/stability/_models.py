@@ -60,7 +60,6 @@ _SEPARABLE = ("linear", "spring")
 GENERAL = {
     "ImplicitMidpoint": Case(ds.ImplicitMidpoint(), weak),
     "SRKw1(b=0)": Case(ds.SRKw1(b=0.0), weak),
-    "SRKw2": Case(ds.SRKw2(), weak),
     "StrangGauss": Case(ds.StrangGauss(), weak),
 }
 SEPARABLE = {
