@@ -99,7 +99,7 @@ def _facts(solver: AbstractSymplecticSolver) -> dict[str, str]:
         "strong": _order(record.strong),
         "weak": _order(record.weak),
         "without noise": str(solver.order(None)),
-        "when to choose it": record.reason,
+        "when to choose it": record.choose,
     }
     if isinstance(solver, ds.LinearFlow):
         facts |= {

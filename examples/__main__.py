@@ -18,7 +18,6 @@ FIGURES = {
     "5": "rigid_body",
     "2d": "synchrotron",
     "2a": "linear_oscillator",
-    "kubo-strong": "kubo",
 }
 
 

@@ -79,13 +79,6 @@ STYLES = {
     "ShARK": Style(BLACK, "--", "X"),
     "ALIGN": Style(BLUE, "--", "<"),
     "QUICSORT": Style(BLACK, "--", ">"),
-    # Samplings, and ways to run them.
-    "IndependentPaths": Style(GREEN, "-", "s"),
-    "ArrayRQMC": Style(BLUE, "-", "^"),
-    "ValueFunctions": Style(WINE, "-", "o"),
-    "JAX": Style(ORANGE, "-", "o"),
-    "fused": Style(INDIGO, "-", "s"),
-    "midpoint by hand": Style(GREY, ":", "x"),
 }
 
 
@@ -98,7 +91,7 @@ _OTHER = Style("0.4", ":", "x")
 
 
 def style(name: str) -> dict[str, Any]:
-    """The arguments of `plot` for a solver or a sampling, by the name of its class, perhaps
+    """The arguments of `plot` for a solver, by the name of its class, perhaps
     with arguments in brackets and more after a comma: `SRKw1(b=0)`, `Heun, springs`."""
     solver, *arguments = re.findall(r"\w+", name)
     # With the solver or the flow within, if that has a style of its own.
@@ -112,11 +105,6 @@ def style(name: str) -> dict[str, Any]:
 def line(name: str) -> dict[str, Any]:
     """The same for curves of many points: without markers."""
     return style(name) | dict(marker="")
-
-
-def dots(name: str) -> dict[str, Any]:
-    """The same for markers without lines, large enough to be told apart by their shapes."""
-    return style(name) | dict(ls="none", ms=8)
 
 
 def colour(name: str) -> str:

@@ -1,6 +1,6 @@
 """The 48 members of SRKw2: the conditions hold for any order of its drift stages, and for
-either sign of the square root of 3. Wang, Hong and Xu print the first; the solver has the
-member with the smallest error in `examples.benchmarks.members`."""
+either sign of the square root of 3. Wang, Hong and Xu print the first; the solver has
+another, with a smaller error."""
 
 from collections.abc import Sequence
 

@@ -5,7 +5,6 @@ every path stays on its circle. Wang, Hong and Xu (2017), example 2: figures 2(c
 """
 
 import diffrax
-import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
@@ -26,10 +25,8 @@ from ._gallery import (
 from ._orders import (
     claim_samples,
     claim_slopes,
-    Errors,
     exact_moment_map,
     exact_weak_error,
-    one_step,
     plot_orders,
     report,
     resolved,
@@ -48,14 +45,6 @@ def make_terms(path, s: float = 1.0):
         return s * energy(t, p, q, args)
 
     return ds.hamiltonian_terms(energy, noise, path)
-
-
-def make_ito_terms(path):
-    """The same system in the Itô sense, for Euler's method: with the drift -y / 2 of the
-    noise added."""
-    drift = lambda t, y, args: jnp.stack([-y[1], y[0]]) - y / 2
-    noise = lambda t, y, args: jnp.stack([-y[1], y[0]])
-    return diffrax.MultiTerm(diffrax.ODETerm(drift), diffrax.ControlTerm(noise, path))
 
 
 # (p, q)
@@ -145,55 +134,7 @@ def figure_3(full: bool) -> None:
         claim(f"largest |radius - 1| of {name}", drift, **bounds)
 
 
-def exact_strong_error(make_terms, solver, y0, hs, t1: float = 1.0) -> Errors:
-    """The root-mean-square error of (p, q) at `t1`. A step turns and stretches q + ip by
-    a factor that depends on the increment alone, and so does the exact solution."""
-    nodes, weights = np.polynomial.hermite_e.hermegauss(40)
-    weights = weights / np.sqrt(2 * np.pi)
-
-    @briefly
-    def ratios(h):
-        """The factor of the method by that of the solution, for each increment."""
-
-        def ratio(W):
-            p, q = one_step(make_terms, solver, y0, h, W)
-            return (q + 1j * p) * jnp.exp(1j * (h + W))
-
-        return jax.vmap(ratio)(jnp.sqrt(h) * nodes)
-
-    errors = []
-    for h in hs:
-        r, steps = np.asarray(ratios(h)), round(t1 / h)
-        square, mean = weights @ np.abs(r) ** 2, weights @ r
-        errors.append(np.sqrt(square**steps - 2 * (mean**steps).real + 1))
-    return Errors(np.array([*hs]), np.array(errors), np.zeros(len(errors)))
-
-
-def figure_strong(full: bool) -> None:
-    """Strong orders 1/2 and 1. Not in the paper, which shows no strong order 1/2."""
-    print("\nStrong error of (p, q) at t = 1 (not in the paper), h = 2^-2 .. 2^-8")
-    hs = [2.0**-k for k in range(2, 9)]
-    solvers = {
-        "SRKs1": ds.SRKs1(),
-        "ImplicitMidpoint": ds.ImplicitMidpoint(),
-        "Milstein": diffrax.StratonovichMilstein(),
-    }
-    exact = {
-        name: exact_strong_error(make_terms, solver, Y0, hs)
-        for name, solver in solvers.items()
-    }
-    exact["Euler (Itô)"] = exact_strong_error(
-        make_ito_terms, diffrax.Euler(), jnp.stack(Y0), hs
-    )
-    report("exact", exact)
-    figure, axes = plt.subplots(figsize=(6, 4.5))
-    plot_orders(axes, "strong error of $(p, q)$", exact, slopes=(0.5, 1))
-    save(figure, "kubo_strong.png")
-    orders = {"SRKs1": 1, "ImplicitMidpoint": 1, "Milstein": 1, "Euler (Itô)": 0.5}
-    claim_slopes(exact, orders)
-
-
-FIGURES = {"2c": figure_2c, "3": figure_3, "kubo-strong": figure_strong}
+FIGURES = {"2c": figure_2c, "3": figure_3}
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import csv
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import diffrax
 import jax
@@ -43,23 +44,11 @@ def portrait(solver) -> np.ndarray:
     noise = lambda t, p, q, args: 0.5 * energy(t, p, q, args)
     path = ds.WeakBrownianPath((), jr.key(0))
     terms = ds.hamiltonian_terms(energy, noise, path)
-    y0 = (jnp.array(0.0), jnp.array(1.0))
-    sol = jax.jit(
-        lambda: (
-            diffrax.diffeqsolve(
-                terms,
-                solver,
-                0,
-                H * STEPS,
-                H,
-                y0,
-                saveat=diffrax.SaveAt(steps=True),
-                max_steps=STEPS + 1,
-                adjoint=diffrax.ForwardMode(),
-            ).ys
-        )
-    )()
-    points = np.stack(sol)
+    options: dict[str, Any] = dict(max_steps=STEPS + 1, adjoint=diffrax.ForwardMode())
+    options["saveat"] = diffrax.SaveAt(steps=True)
+    end = H * STEPS
+    solve = lambda: diffrax.diffeqsolve(terms, solver, 0, end, H, Y0, **options).ys
+    points = np.stack(jax.jit(solve)())
     return points[:, np.all(np.abs(points) < 1e3, axis=0)]
 
 

@@ -1,14 +1,13 @@
-"""All benchmarks: `python -m examples.benchmarks`."""
+"""All benchmarks of `docs/benchmarks`: `python -m examples.benchmarks`."""
 
-from . import calls, ensemble, speed, tolerance, work_precision
+from . import calls, scan, speed, work_precision
 
 
 def main() -> None:
-    speed.main()
-    calls.main()
-    ensemble.main()
-    tolerance.main()
     work_precision.main("errors", "seconds")
+    speed.main()
+    scan.main()
+    calls.main()
 
 
 if __name__ == "__main__":

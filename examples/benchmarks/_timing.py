@@ -3,8 +3,9 @@
 import datetime
 import os
 import platform
+import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,22 @@ import jax.random as jr
 jax.config.update("jax_enable_x64", True)
 
 DOCS = Path(__file__).parents[2] / "docs" / "benchmarks"
+
+
+def write(module: str, lines: Iterable[str], page: Path = DOCS / "index.md") -> None:
+    """Puts the lines into the part of the page that a module makes."""
+    head = f"<!-- made by {module} -->"
+    part = re.compile(f"{re.escape(head)}.*?<!-- end -->", re.DOTALL)
+    text = "\n".join([head, "", *lines, "", "<!-- end -->"])
+    page.write_text(part.sub(lambda _: text, page.read_text()))
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """The lines of a table, printed too."""
+    cells = [head, ["---"] * len(head), *rows]
+    lines = [f"| {' | '.join(row)} |".replace("|  |", "| |") for row in cells]
+    print("\n".join(lines), flush=True)
+    return lines
 
 
 class Timing(NamedTuple):

@@ -3,7 +3,7 @@
     python -m examples.benchmarks.calls
 
 Each call is measured in a process of its own, since a process remembers what it has traced
-and compiled. Writes the second part of `docs/benchmarks/speed.md`.
+and compiled. Writes its part of `docs/benchmarks/index.md`.
 """
 
 import json
@@ -22,15 +22,13 @@ import jax.random as jr
 
 import diffrax_symplectic as ds
 
-from ._timing import DOCS, machine
+from ._timing import machine, table, write
 
 
 STEPS, H = 10, 0.1
 PATHS = 64
 REPEATS = 10
 Y0 = (jnp.array(0.0), jnp.array(1.0))
-HEADING = "## First and repeated calls"
-OLDER_CODE = {"XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false"}
 
 
 class Seconds(NamedTuple):
@@ -78,14 +76,6 @@ def expectation(solver: Any, **arguments: Any) -> Callable:
     return lambda i: ds.expectation(*problem, key=jr.key(i), **arguments)
 
 
-def ensemble(engine: str) -> Callable:
-    terms, solver = pendulum(()), ds.ImplicitMidpoint()
-    problem = (terms, solver, 0.0, STEPS * H, H, Y0)
-    return lambda i: ds.ensemble(
-        *problem, key=jr.key(i), num_paths=PATHS, engine=engine
-    )
-
-
 FEW = ds.IndependentPaths(PATHS)
 SOLVERS = (ds.StormerVerlet(), ds.ImplicitMidpoint(), ds.StrangGauss())
 DEFAULTS = {
@@ -98,7 +88,7 @@ SOLVES = {
     f"jitted `diffeqsolve`, `{type(solver).__name__}`": (
         lambda solver=solver: solved_by(solver)
     )
-    for solver in (ds.ImplicitMidpoint(), ds.StrangGauss(), ds.SRKw2())
+    for solver in (ds.ImplicitMidpoint(), ds.StrangGauss())
 }
 HEUN = "jitted `diffeqsolve`, `Heun`"
 CALLS: dict[str, Callable[[], Callable]] = {
@@ -113,8 +103,6 @@ CALLS: dict[str, Callable[[], Callable]] = {
             ds.ImplicitMidpoint(), sampling=FEW, levels=1, engine="drjit"
         )
     ),
-    f"`ensemble` of {PATHS} paths": lambda: ensemble("jax"),
-    f'`ensemble` of {PATHS} paths, `engine="drjit"`': lambda: ensemble("drjit"),
 }
 
 
@@ -159,62 +147,31 @@ def in_a_second_process(name: str) -> Seconds:
         return in_a_process(name, settings)
 
 
-def row(name: str, time: Seconds, unit: Seconds) -> str:
-    ratio = time.first / unit.first
-    cells = [name, f"{time.first:.2f}", f"{ratio:.1f}", f"{time.repeated * 1e3:.1f}"]
-    line = f"| {' | '.join(cells)} |"
-    print(line, flush=True)
-    return line
-
-
-def conclusion(measured: dict[str, Seconds]) -> str:
-    of_defaults = [measured[name] for name in DEFAULTS]
-    firsts = [time.first / measured[HEUN].first for time in of_defaults]
-    later = [time.repeated for time in of_defaults]
-    return (
-        f"A first `expectation` takes {min(firsts):.0f} to {max(firsts):.0f} times as long "
-        "as the first jitted `Heun`; later calls take "
-        f"{min(later):.2f} to {max(later):.2f} s."
-    )
-
-
-def table(measured: dict[str, Seconds]) -> list[str]:
-    unit = measured[HEUN]
-    lines = [
-        "| call | first, s | first, of Heun's | repeated, ms |",
-        "|---|---|---|---|",
-        row(HEUN, unit, unit),
-    ]
-    for name in CALLS:
-        if name != HEUN:
-            lines.append(row(name, measured[name], unit))
-    for name in (HEUN, *SOLVES):
-        label = f"{name}, older code generator"
-        lines.append(row(label, in_a_process(name, OLDER_CODE), unit))
-    for name in DEFAULTS:
-        label = f"{name}, second process"
-        lines.append(row(label, in_a_second_process(name), unit))
-    return lines
-
-
 def main() -> None:
     measured = {name: in_a_process(name, {}) for name in CALLS}
-    head = [
-        HEADING,
-        "",
-        conclusion(measured),
-        "",
-        f"Processor time of a pendulum with one noise and {STEPS} steps, float64; each row "
-        f'in its own process, repeated calls with other keys (best of {REPEATS}). "Older '
-        f'code generator": `XLA_FLAGS={OLDER_CODE["XLA_FLAGS"]}`. "Second process": '
-        f"programs found in JAX's cache. {machine()}. Made by `python -m "
-        "examples.benchmarks.calls`.",
-        "",
+    later = {name: in_a_second_process(name) for name in DEFAULTS}
+    rows = [
+        (
+            name,
+            f"{time.first:.2f}",
+            f"{later[name].first:.2f}" if name in later else "",
+            f"{time.repeated * 1e3:.1f}",
+        )
+        for name, time in measured.items()
     ]
-    page = DOCS / "speed.md"
-    before, *_ = page.read_text().split(HEADING)
-    section = "\n".join([*head, *table(measured)])
-    page.write_text(f"{before.rstrip()}\n\n{section}\n")
+    of_defaults = [measured[name] for name in DEFAULTS]
+    firsts = [time.first / measured[HEUN].first for time in of_defaults]
+    repeated = [time.repeated for time in of_defaults]
+    lines = [
+        f"A first `expectation` takes {min(firsts):.0f} to {max(firsts):.0f} times as long "
+        f"as the first jitted `Heun`; later calls take {min(repeated):.2f} to "
+        f"{max(repeated):.2f} s. Processor time of a pendulum with one noise and {STEPS} "
+        "steps, float64; each row in its own process, then in one that finds its programs "
+        f"in JAX's cache; repeated calls with other keys (best of {REPEATS}). {machine()}.",
+        "",
+        *table(("call", "first, s", "from JAX's cache, s", "repeated, ms"), rows),
+    ]
+    write("examples.benchmarks.calls", lines)
 
 
 if __name__ == "__main__":

@@ -10,8 +10,8 @@ Strong errors are root mean squares over one set of Brownian paths, by `compare_
 The first measures these, in a quarter of an hour of processor time on however busy a
 machine. The second measures costs, and wants a quiet one: CPU seconds per path, in batches
 of 10,000, in turns after all programs are compiled. What was measured is kept in
-`docs/benchmarks/work_precision.json`, from which all three write `work_precision.md` and
-its pictures.
+`docs/benchmarks/work_precision.json`, from which all three write their part of
+`docs/benchmarks/index.md` and its pictures.
 """
 
 import functools as ft
@@ -39,7 +39,7 @@ from .._orders import (
 )
 from .._pictures import style, WIDTH
 from ._exact import two_noises_square
-from ._timing import DOCS, ensemble, keys, machine
+from ._timing import DOCS, ensemble, keys, machine, table, write
 
 
 KEPT = DOCS / "work_precision.json"
@@ -49,6 +49,8 @@ H, STEPS = 1 / 64, 16
 HS = [2.0**-k for k in range(1, 8)]
 # Which one the table shows. Strong errors begin with the second step size.
 SHOWN = 3
+# The pictures have these, too.
+OMITTED = "StratonovichMilstein", "SRKs1", "SRKs3", "SRKw2", "SRKw3a", "SRKw3c"
 
 Weak = lambda shape, **kwargs: lambda key: ds.WeakBrownianPath(shape, key, **kwargs)
 Gaussian = lambda shape: lambda key: ds.FixedStepBrownianPath(shape, key)
@@ -299,49 +301,42 @@ def draw(kind: str, kept: dict) -> None:
     plt.close(figure)
 
 
-def rows(kind: str, model: str, kept: dict) -> list[str]:
-    """Of the table."""
-    lines = []
-    system = model
+def cell(kind: str, model: str, kept: dict) -> str:
+    """Errors and microseconds of all solvers."""
+    out = []
     for name, fields in kept["errors"][kind][model].items():
         e = Errors._make(np.array(fields))
-        seconds = kept["seconds"][kind][model][name] / e.hs[SHOWN]
+        micro = kept["seconds"][kind][model][name] / e.hs[SHOWN] * 1e6
         error, own = e.errors[SHOWN], e.std_errors[SHOWN]
         bar = f" ± {own:.0e}" if own > error / 10 else ""
-        if name != "StratonovichMilstein":  # the picture has it
-            cells = system, name, f"{error:.1e}{bar}", f"{seconds * 1e6:.2f}"
-            lines.append(f"| {' | '.join(cells)} |".replace("|  |", "| |"))
-            system = ""  # only in the first row of a system
-    return lines
+        if name not in OMITTED:
+            out.append(f"{name} {error:.1e}{bar} ({micro:.2f})")
+    return ", ".join(out)
 
 
 EXPLAINED = {
-    "weak": f"Errors at $h = 1/{1 / HS[SHOWN]:g}$, exact for linear models, else from "
-    "`ArrayRQMC`.",
-    "strong": f"Root mean squares over 500 Brownian paths at $h = 1/{1 / HS[1 + SHOWN]:g}$ "
-    "(`compare_solvers`).",
+    "weak": f"Weak errors at $h = 1/{1 / HS[SHOWN]:g}$, exact for linear models, else from "
+    "`ArrayRQMC`:",
+    "strong": "Strong errors, root mean squares over 500 Brownian paths at "
+    f"$h = 1/{1 / HS[1 + SHOWN]:g}$ (`compare_solvers`):",
 }
-HEAD = "| system | solver | error | µs |", "|---" * 4 + "|"
 
 
-def write(kept: dict) -> None:
+def write_page(kept: dict) -> None:
     lines = [
-        "# Speed against accuracy",
-        "",
         Path(__file__).with_suffix(".md").read_text().strip(),
         "",
         "Bars: three standard errors; points not clear of zero are omitted. CPU time per "
-        f"path, one core, batches of 10,000. {kept['machine']}. Made by `python -m "
-        "examples.benchmarks.work_precision`.",
+        f"path, one core, batches of 10,000. {kept['machine']}.",
     ]
     for kind in ERRORS:
         draw(kind, kept)
-        title = f"{kind.title()} errors"
-        picture = f"![{title} against CPU seconds per path](work_precision_{kind}.png)"
-        lines += ["", f"## {title}", "", picture, "", EXPLAINED[kind], "", *HEAD]
-        for model in STRONG:
-            lines += rows(kind, model, kept)
-    (DOCS / "work_precision.md").write_text("\n".join(lines) + "\n")
+        title = f"{kind.title()} errors against CPU seconds per path"
+        picture = f"![{title}](work_precision_{kind}.png)"
+        cells = [(model, cell(kind, model, kept)) for model in STRONG]
+        shown = table(("system", "error of each solver (µs per path)"), cells)
+        lines += ["", picture, "", EXPLAINED[kind], "", *shown]
+    write("examples.benchmarks.work_precision", lines)
 
 
 def main(*kinds: str) -> None:
@@ -354,7 +349,7 @@ def main(*kinds: str) -> None:
         kept["machine"] = machine()
     if kinds:
         KEPT.write_text(json.dumps(kept, indent=1) + "\n")
-    write(kept)
+    write_page(kept)
 
 
 if __name__ == "__main__":

@@ -21,6 +21,7 @@ import diffrax_symplectic as ds
 
 from .._pictures import line, WIDTH
 from ..stability._page import fill, Page, table
+from ..stability.solvability import Given
 
 
 S = 0.3
@@ -51,17 +52,6 @@ class Network(eqx.Module):
         return jnp.sum(self.c * jax.nn.softplus(self.a * q + self.b))
 
 
-class _Given(diffrax.AbstractBrownianPath):
-    W: jax.Array
-    t0 = -jnp.inf
-    t1 = jnp.inf
-    levy_area = diffrax.BrownianIncrement
-
-    def evaluate(self, t0, t1=None, left=True, use_levy=False):
-        del t0, t1, left, use_levy
-        return self.W
-
-
 def make_terms(potential, s, path):
     return ds.hamiltonian_terms(
         lambda t, p, q, args: p**2 / 2 + potential(q),
@@ -75,7 +65,7 @@ def flow(solver, potential, s, y0, W):
     h = SPACING / len(W)
 
     def step(y, dw):
-        terms = make_terms(potential, s, _Given(dw))  # pyright: ignore[reportCallIssue]
+        terms = make_terms(potential, s, Given(dw))  # pyright: ignore[reportCallIssue]
         return solver.step(terms, 0.0, h, y, None, None, False)[0], None
 
     return jnp.stack(jax.lax.scan(step, y0, W)[0])

@@ -1,9 +1,7 @@
 """A stochastic nonlinear Schroedinger lattice: 1,024 sites, a noise on each.
 
 i d psi_j = -(psi_(j+1) - 2 psi_j + psi_(j-1)) / (2 dx^2) dt - |psi_j|^2 psi_j dt
-            + s psi_j o dw_j, on a ring; psi = q + i p. The norm sum |psi_j|^2 is a
-quadratic invariant of drift and noises. With C = sum_j Re(psi_(j+1) conj(psi_j)),
-E H0 grows by (s^2 / (2 dx^2)) E C in each unit of time.
+            + s psi_j o dw_j, on a ring; psi = q + i p.
 """
 
 import time
@@ -14,16 +12,12 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import lineax as lx
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.ticker import NullFormatter
 
 import diffrax_symplectic as ds
 
 from .._orders import FinePath
-from .._pictures import style
 from ..stability._page import fill, Page, table
-from ._ensemble import ensemble, Mean, weak
 
 
 N = 1024
@@ -34,18 +28,13 @@ DX = 0.25
 # a field v(psi) = sqrt(2) psi has the equation above.
 
 
-def energy(p, q, dx: float = DX):
-    bonds = sum(jnp.sum((jnp.roll(x, -1) - x) ** 2) for x in (p, q)) / (4 * dx**2)
-    return bonds - jnp.sum((p**2 + q**2) ** 2) / 4
-
-
 def hopping(psi, dx: float = DX):
     """The linear part of H0."""
     return jnp.sum(jnp.abs(jnp.roll(psi, -1) - psi) ** 2) / (2 * dx**2)
 
 
 def attraction(t, psi, s):
-    """What is left of H0."""
+    """What is left of the energy."""
     return -jnp.sum(jnp.abs(psi) ** 4)
 
 
@@ -78,41 +67,6 @@ def start(n: int = N, dx: float = DX):
     """A soliton of height 1 in the middle that moves to the right."""
     x = dx * (np.arange(n) - n / 2)
     return ds.to_pair(jnp.asarray(np.exp(0.5j * x) / np.cosh(x) / np.sqrt(2)))
-
-
-def _observe(t, y, s):
-    p, q = y
-    coherence = jnp.sum(p * jnp.roll(p, -1) + q * jnp.roll(q, -1))
-    return jnp.sum(p**2 + q**2), energy(p, q), coherence
-
-
-class Lattice(NamedTuple):
-    # The largest relative error of the norm in any path that did not fail.
-    norm_error: float
-    # H0(t1) - H0(0) less what the noise brings on average.
-    balance: Mean
-    failed: float
-
-
-def lattice(solver, h: float, t1: float, paths: int, s: float, n: int = N) -> Lattice:
-    y0, steps = start(n), round(t1 / h)
-    terms = make_rest if isinstance(solver, ds.LinearFlow) else make_terms
-    saveat = diffrax.SaveAt(t0=True, steps=True, fn=_observe)
-    _, (norms, energies, coherence), failed = ensemble(
-        terms, weak((n,)), solver, y0, h, steps, paths, args=s, saveat=saveat
-    )
-    good = ~failed
-    # Rows that were not needed are infinite.
-    cut = lambda x: np.asarray(x)[good, : steps + 1]
-    norms, energies, coherence = cut(norms), cut(energies), cut(coherence)
-    if not good.any():
-        nan = np.nan
-        return Lattice(nan, Mean(nan, nan), 1.0)
-    middle = (coherence[:, 1:] + coherence[:, :-1]) / 2
-    brought = s**2 / (2 * DX**2) * h * np.sum(middle, axis=1)
-    balance = Mean.of(energies[:, -1] - energies[:, 0] - brought)
-    error = float(np.max(np.abs(norms / norms[:, :1] - 1)))
-    return Lattice(error, balance, float(np.mean(failed)))
 
 
 # No dense matrix of 2,048 unknowns, should fixed points not contract.
@@ -160,8 +114,8 @@ def ends(solver, steps: int, dx: float, s: float, paths: list[FinePath]) -> Ends
     return Ends(np.array(psi), seconds)
 
 
-def strong_errors(page: Page, s: float) -> str:
-    """A table of errors along a path, and of what they cost."""
+def section(page: Page) -> str:
+    s = 0.1
     fine, number = (2**8, 1) if page.quick else (2**13, 2)
     draw = jax.jit(lambda key: FinePath.draw(key, fine, N, 1.0))
     paths = [draw(jr.key(i)) for i in range(number)]
@@ -184,43 +138,5 @@ def strong_errors(page: Page, s: float) -> str:
                 rows.append(
                     (f"{dx:g}", name, f"1/{steps}", error, f"{found.seconds:.3f}")
                 )
-    return table(("$\\Delta$", "solver", "$h$", "error", "seconds"), rows)
-
-
-SOLVERS = {
-    "ImplicitMidpoint": MIDPOINT,
-    "LinearFlow(ImplicitMidpoint)": split(),
-    "Heun": diffrax.Heun(),
-    "EulerHeun": diffrax.EulerHeun(),
-}
-
-
-def section(page: Page) -> str:
-    t1, paths = (0.5, 2) if page.quick else (5.0, 16)
-    hs = [0.01] if page.quick else [0.04, 0.02, 0.01]
-    names = list(SOLVERS)[:2] if page.quick else SOLVERS
-    s = 0.1
-    print(f"\nSchroedinger lattice, {N:,} sites, until t = {t1:g}, {paths} paths")
-    found = {}
-    figure, ax = plt.subplots(figsize=(6, 3.6))
-    for name in names:
-        errors = []
-        for h in hs:
-            r = lattice(SOLVERS[name], h, t1, paths, s)
-            found[name, h] = r
-            errors.append(r.norm_error)
-            assert r.failed == 0
-        if np.any(np.isfinite(errors)):
-            ax.loglog(hs, errors, label=name, **style(name))
-    ax.set(xlabel="step $h$", ylabel="relative error of the norm")
-    ax.set_xticks(hs, [f"{h:g}" for h in hs])
-    ax.xaxis.set_minor_formatter(NullFormatter())
-    ax.legend(loc="center right")
-    picture = page.picture(figure, "nls", "Stochastic nonlinear Schrödinger lattice")
-    ours, divided = (found[name, hs[0]] for name in SOLVERS if "Midpoint" in name)
-    return fill(
-        __file__, picture=picture, t1=f"{t1:g}", paths=paths, s=s, h=hs[0], n=f"{N:,}",
-        frequency=f"{2 / DX**2:g}", strong=strong_errors(page, s),
-        norm=f"{ours.norm_error:.1e}", balance=ours.balance,
-        split_norm=f"{divided.norm_error:.1e}", split_balance=divided.balance,
-    )  # fmt: skip
+    shown = table(("$\\Delta$", "solver", "$h$", "error", "seconds"), rows)
+    return fill(__file__, table=shown, s=s, n=f"{N:,}", frequency=f"{2 / DX**2:g}")

@@ -1,4 +1,5 @@
-"""The sources of the notebooks in `docs/examples`, which import public names alone.
+"""The sources of the notebooks in `docs/examples`, which import public names and, for the
+models of the paper, `examples`.
 
 A script is made of cells: `# %% [markdown]` begins a text, `# %%` begins code, and what
 stands behind it describes the picture that the code draws.

@@ -52,14 +52,22 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(lines + ["| " + " | ".join(row) + " |" for row in rows])
 
 
+def merged(rows: Iterable[Sequence[str]]) -> list[Sequence[str]]:
+    """The rows, one for all names that have the same cells."""
+    names: dict[tuple[str, ...], list[str]] = {}
+    for name, *cells in rows:
+        names.setdefault(tuple(cells), []).append(name)
+    return [(", ".join(same), *cells) for cells, same in names.items()]
+
+
 def fill(module: str, **values) -> str:
     """The text next to a module, with what was measured put in the braces."""
     return Path(module).with_suffix(".md").read_text().format(**values)
 
 
 def run(name: str, description: str | None, modules: Sequence[str]) -> None:
-    """The command that makes a page: the text of `page.md` next to the modules, and a
-    section of each. They are imported here, for they use JAX."""
+    """The command that makes a page: the text of `page.md` next to the modules, a section
+    of each, and the text of `tail.md`. They are imported here, for they use JAX."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument(
         "--quick",
@@ -81,5 +89,6 @@ def run(name: str, description: str | None, modules: Sequence[str]) -> None:
         source = importlib.import_module(f"examples.{name}.{module}")
         sections.append(source.section(page))
         print(f"({time.perf_counter() - begin:.0f} seconds)", flush=True)
-    page.write(sections)
+    tail = ROOT / "examples" / name / "tail.md"
+    page.write([*sections, tail.read_text()] if tail.exists() else sections)
     print(f"\nAll done in {time.perf_counter() - start:.0f} seconds.")

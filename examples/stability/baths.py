@@ -11,7 +11,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._solver import LANGEVIN
 
 from .._pictures import colour, style, WIDTH
-from ._page import fill, Page, table
+from ._page import fill, merged, Page, table
 
 
 OMEGA, FRICTION = 20.0, 0.5
@@ -95,7 +95,7 @@ def section(page: Page) -> str:
         rows.append((f"`{name}`", *map(_cell, found[: len(SHOWN)])))
         curves[name] = found[len(SHOWN) :]
     heads = ["solver", *(f"$h \\omega = {x:g}$" for x in SHOWN)]
-    energy_table = table(heads, rows)
+    energy_table = table(heads, merged(rows))
     picture = page.picture(
         _picture(fine, curves), "baths", "Energies of a mode in a heat bath"
     )

@@ -115,10 +115,9 @@ def section(page: Page) -> str:
         taken = steps[:1] if page.quick else steps
         found = np.array([measured(solver, h, page.quick) for h in taken])
         means, errors = found.T
-        for h, mean, error in zip(taken, means, errors):
-            rows.append(
-                (f"`{name}`", f"{h:g}", f"{1 / h:.1f}", f"{mean:.3f} ± {error:.3f}")
-            )
+        shown = [f"{h:g}: {mean:.2f}" for h, mean in zip(taken, means)]
+        rows.append((f"`{name}`", ", ".join(shown)))
+        print(f"  standard errors {errors}", flush=True)
         ax.errorbar(taken, means, 2 * errors, label=name, **style(name))
     band = EXACT * (1 - PROMISED), EXACT * (1 + PROMISED)
     ax.axhspan(*band, color="k", alpha=0.15, lw=0)
@@ -129,7 +128,6 @@ def section(page: Page) -> str:
     if not page.quick:
         ax.set(ylim=(56.6, 57.4))  # resonances lie far below
     figure.legend(loc="outside lower center", ncols=2)
-    heads = "solver", "$h$", "soft forces per time", "mean soft energy"
-    energies = table(heads, rows)
+    energies = table(("solver", "$h$: mean soft energy"), rows)
     picture = page.picture(figure, "chain", "Mean soft energy against the step")
     return fill(__file__, table=energies, picture=picture, exact=f"{EXACT:g}")

@@ -10,7 +10,7 @@ from diffrax_symplectic._solver import LANGEVIN, SOLVERS
 from diffrax_symplectic._suggest import FOR_MEANS, FOR_PATHS
 
 from ._models import stationary, with_newton
-from ._page import fill, Page, table
+from ._page import fill, merged, Page, table
 
 
 # Well resolved, so that friction is all that a step may get wrong.
@@ -86,7 +86,7 @@ def section(page: Page) -> str:
     heads = ["solver", *(f"$\\gamma h = {x:g}$" for x in SHOWN), "limit"]
     return fill(
         __file__,
-        table=table(heads, rows),
+        table=table(heads, merged(rows)),
         omega_h=f"{OMEGA_H:g}",
         percent=f"{100 * TOLERANCE:g}",
     )

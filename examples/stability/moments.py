@@ -16,8 +16,8 @@ from ._page import fill, Page, table
 ALL = {**GENERAL, **SEPARABLE, **EXPLICIT}
 QUICK = ("ImplicitMidpoint", "SRKs3", "Heun", "Euler")
 SHOWN = (
-    "ImplicitMidpoint", "SRKw1(b=0)", "SRKw2", "StrangGauss", "SRKs3", "SRKw3b",
-    "SRKw3c", "SRKw4", "Heun", "SlowRK", "Euler",
+    "ImplicitMidpoint", "SRKw1(b=0)", "StrangGauss", "SRKs3", "SRKw4", "Heun", "SlowRK",
+    "Euler",
 )  # fmt: skip
 # A short step and a long one, weak noise and strong noise.
 HS = np.array([0.1, 2.0])

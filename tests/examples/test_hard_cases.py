@@ -12,20 +12,13 @@ import pytest
 
 import diffrax_symplectic as ds
 from examples.hard_cases import (
-    chain,
     double_well,
-    henon_heiles,
     learning,
-    magnet,
-    nls,
     rods,
-    spins,
     two_body,
 )
 from examples.hard_cases._ensemble import ensemble, Mean, truncated
 from examples.hard_cases._stationary import stationary_bias, Step
-
-from ..problems import FineSample, slope
 
 
 pytestmark = pytest.mark.slow
@@ -133,103 +126,6 @@ def test_double_well_with_friction_has_nearly_the_moments_of_gibbs():
     step = double_well.LANGEVIN["BAOAB"][0]._replace(make_terms=cold)
     [[q2, _]] = stationary_bias(step, V, 0.1, [h])
     assert abs(q2) <= 1e-3
-
-
-def test_harmonic_chain_in_64_unknowns_is_heated_as_in_closed_form():
-    hs = (0.1, 1.0)
-    r = chain.heating(ds.ImplicitMidpoint(), hs)
-    assert np.max(r.energy_defect) <= 1e-13
-    np.testing.assert_allclose(
-        r.rate, list(map(chain.midpoint_heating, hs)), rtol=1e-12
-    )
-
-
-def test_nonlinear_chain_of_32_has_the_exact_mean_energy_and_symplectic_steps():
-    args = chain.Args(beta=1.0, s=0.2)
-    r = chain.nonlinear(*chain.SOLVERS["ImplicitMidpoint"], 0.05, 2.0, 64, args)
-    assert r.failed == 0
-    assert abs(r.excess.sigmas) <= 4
-    assert np.max(chain.symplecticity(ds.ImplicitMidpoint(), (0.1, 0.4), args)) <= 1e-13
-
-
-def test_henon_heiles_orbits_leave_for_the_energy_of_the_noise_only():
-    ours = henon_heiles.stay(
-        *henon_heiles.SOLVERS["ImplicitMidpoint"], 0.003, 0.2, 100.0, paths=512
-    )
-    heun = henon_heiles.stay(
-        *henon_heiles.SOLVERS["Heun"], 0.003, 0.2, 100.0, paths=512
-    )
-    assert ours.failed == heun.failed == 0
-    assert abs(ours.balance.sigmas) <= 4
-    assert heun.balance.sigmas > 20
-    assert heun.left.value > ours.left.value + 0.2
-
-
-def test_henon_heiles_converges_to_itself():
-    steps, fine = [2.0**-k for k in (3, 4, 5)], 2**9
-
-    def ends(key):
-        terms = henon_heiles.make_terms(FineSample.draw(key, fine, 2))
-        solve = lambda h: jnp.concatenate(
-            diffrax.diffeqsolve(
-                terms, ds.ImplicitMidpoint(), 0.0, 1.0, h, henon_heiles.start(), 0.3
-            ).ys,
-            axis=1,
-        )[0]
-        return jax.lax.map(solve, jnp.array([*steps, 1 / fine]))
-
-    ys = jax.jit(jax.vmap(ends))(jr.split(jr.key(0), 50))
-    squared = jnp.sum((ys[:, :-1] - ys[:, -1:]) ** 2, axis=-1)
-    measured = slope(np.array(steps), np.sqrt(jnp.mean(squared, axis=0)))
-    assert abs(measured - 1) <= 0.15
-
-
-def test_ring_of_spins_keeps_its_total_spin_and_gains_no_energy_without_noise():
-    lift, _, heun = spins.METHODS.values()
-    ours = spins.course(lift, 0.0, 0.2, 100, 1, spins=32)
-    assert ours.length_error.max() <= 1e-13
-    assert ours.total_error <= 1e-12
-    # A hundredth of what it is.
-    assert ours.energy_error <= 0.01 * abs(ours.energy[0, 0])
-    theirs = spins.course(heun, 0.0, 0.2, 100, 1, spins=32)
-    assert theirs.length_error.max() <= 1e-15
-    assert theirs.total_error > 1 and theirs.energy_error > 1
-
-
-def test_a_magnet_has_the_energy_and_magnetization_of_its_temperature():
-    # More damping forgets faster.
-    shape, T = (4, 4, 2), 2.0
-    ours = magnet.dynamics(T, 0.1, 2_000, shape, alpha=2.0)
-    exact = magnet.monte_carlo(T, 8_000, shape)
-    assert ours.length_error <= 1e-13
-    sigmas = lambda other: (
-        np.abs(ours.values - other.values) / np.hypot(ours.std_errors, other.std_errors)
-    )
-    assert np.all(sigmas(exact) <= 4)
-    # It would be seen if the energy were that of a magnet a fifth hotter.
-    assert sigmas(magnet.monte_carlo(1.2 * T, 8_000, shape))[0] > 4
-
-
-def test_ring_of_spins_with_noise_decays_as_in_closed_form():
-    sigma = 0.5
-    c = spins.course(next(iter(spins.METHODS.values())), sigma, 0.1, 20, 512, spins=8)
-    for mean in (c.excess(sigma), c.total_excess(sigma)):
-        assert abs(mean.sigmas) <= 4
-        assert mean.std_error <= 0.2
-    # Both would be seen if they stayed what they were.
-    assert abs(c.energy[0, 0]) * (1 - np.exp(-2 * sigma**2 * 2)) > 1
-
-
-def test_schroedinger_lattice_keeps_its_norm_and_gains_the_energy_of_the_noise():
-    ours, heun = (
-        nls.lattice(nls.SOLVERS[name], 0.02, 1.0, 8, 0.1, n=128)
-        for name in ("ImplicitMidpoint", "Heun")
-    )
-    assert ours.failed == heun.failed == 0
-    assert ours.norm_error <= 1e-13
-    assert abs(ours.balance.sigmas) <= 4
-    # Heun multiplies the highest modes, of frequency 32, in each step.
-    assert heun.norm_error > 1e-3
 
 
 def test_the_law_of_rods_is_the_volume_of_the_momenta_that_they_allow():

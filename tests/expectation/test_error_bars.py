@@ -16,9 +16,9 @@ from diffrax_symplectic._expectation.run import run
 from diffrax_symplectic._expectation.sampling import Averaged, Samples, SamplingPlan
 from diffrax_symplectic._simulation.levels import Combination
 from diffrax_symplectic._simulation.problem import Problem
-from examples.benchmarks.coverage import arguments, Cell, estimate, exact
 
 from ..problems import kubo_terms
+from .cells import arguments, Cell, estimate, exact
 
 
 KEY = jr.key(0)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from examples import qubit
 
 from ..problems import slope, weak_path
 
@@ -110,6 +109,52 @@ def test_norm_is_kept_over_ten_thousand_steps(solver):
     assert jnp.max(jnp.abs(sol.ys - 1)) <= bound
 
 
+# A noisy qubit: i dpsi = H psi dt + A psi o dw. The mean of psi psi^dagger follows
+# d rho / dt = -i [H, rho] - [A, [A, rho]] / 2.
+H, A = X / 2 + 0.3 * Z, 0.3 * (Z + X / 2)
+QUBIT = np.array([np.sqrt(0.9), np.sqrt(0.1) * 1j])
+
+
+def _qubit(path):
+    return ds.wave_terms(
+        lambda t, psi, args: _mean(H, psi), lambda t, psi, args: _mean(A, psi), path
+    )
+
+
+def _lindblad(t):
+    """The density matrix."""
+    commutator = lambda M: np.kron(M, np.eye(2)) - np.kron(np.eye(2), M.T)
+    L = -1j * commutator(H) - commutator(A) @ commutator(A) / 2
+    rho = np.outer(QUBIT, np.conj(QUBIT)).ravel()
+    return (jax.scipy.linalg.expm(t * L) @ rho).reshape(2, 2)
+
+
+def _density(solver, t: float, steps: int):
+    """The density matrix by steps, without sampling: of the mean of p, q and their
+    products."""
+    y0 = ds.to_pair(jnp.asarray(QUBIT))
+    terms = _qubit(ds.WeakBrownianPath((), jr.key(0)))
+    K = ds.second_moment_map(terms, solver, 0.0, t / steps, y0)
+    flat = jnp.concatenate([jnp.ones(1), *y0])
+    moments = jnp.linalg.matrix_power(K, steps) @ jnp.kron(flat, flat)
+    m = moments.reshape(5, 5)[1:, 1:]  # of p1, p2, q1, q2
+    pp, pq, qp, qq = m[:2, :2], m[:2, 2:], m[2:, :2], m[2:, 2:]
+    return (qq + pp + 1j * (pq - qp)) / 2
+
+
+def _sampled(key, times, h: float):
+    """<sigma_x> and <sigma_z> of one path."""
+    terms = _qubit(ds.WeakBrownianPath((), key))
+    sol = diffrax.diffeqsolve(
+        terms, ds.StrangGauss(), 0.0, times[-1], h, ds.to_pair(jnp.asarray(QUBIT)),
+        saveat=diffrax.SaveAt(ts=times), adjoint=diffrax.ForwardMode(),
+        max_steps=round(times[-1] / h) + 1,
+    )  # fmt: skip
+    assert sol.ys is not None
+    psi = ds.from_pair(sol.ys)
+    return jax.vmap(lambda psi: jnp.stack([_mean(M, psi) for M in (X, Z)]))(psi)
+
+
 @pytest.mark.parametrize(
     "solver, order",
     [(ds.SRKw1(), 1), (ds.StrangGauss(), 2)],
@@ -117,9 +162,9 @@ def test_norm_is_kept_over_ten_thousand_steps(solver):
 )
 def test_noisy_qubit_has_the_density_matrix_of_lindblad_without_sampling(solver, order):
     steps = np.array([16, 32, 64])
-    found = jnp.stack([qubit.density(solver, 2.0, int(n)) for n in steps])
+    found = jnp.stack([_density(solver, 2.0, int(n)) for n in steps])
     np.testing.assert_allclose(jnp.trace(found, axis1=1, axis2=2), 1.0, rtol=1e-12)
-    errors = jnp.max(jnp.abs(found - qubit.lindblad(2.0)), axis=(1, 2))
+    errors = jnp.max(jnp.abs(found - _lindblad(2.0)), axis=(1, 2))
     assert abs(slope(1 / steps, errors) - order) <= 0.1
     assert errors[-1] <= (1e-2 if order == 1 else 1e-4)
 
@@ -127,17 +172,14 @@ def test_noisy_qubit_has_the_density_matrix_of_lindblad_without_sampling(solver,
 @pytest.mark.slow
 def test_noisy_qubit_sampled():
     times = np.array([1.0, 2.0])
-    path = lambda key: qubit.sampled(key, times, 0.1)
+    path = lambda key: _sampled(key, times, 0.1)
     values = jax.jit(jax.vmap(path))(jr.split(jr.key(0), 4000))
-    rho = jnp.stack([qubit.lindblad(t) for t in times])
-    exact = [jnp.trace(rho @ M, axis1=1, axis2=2).real for M in (qubit.X, qubit.Z)]
+    rho = jnp.stack([_lindblad(t) for t in times])
+    exact = [jnp.trace(rho @ M, axis1=1, axis2=2).real for M in (X, Z)]
     error = jnp.mean(values, axis=0) - jnp.stack(exact, axis=-1)
     standard_error = jnp.std(values, axis=0) / np.sqrt(len(values))
     assert jnp.max(standard_error) <= 0.01
     assert jnp.max(jnp.abs(error) / standard_error) <= 3
-
-
-PSI0 = qubit.PSI0
 
 
 def test_gradients_with_respect_to_complex_parameters_are_those_of_jax():
@@ -153,13 +195,13 @@ def test_gradients_with_respect_to_complex_parameters_are_those_of_jax():
         return jnp.abs(ds.from_pair(sol.ys)[-1, 0]) ** 2
 
     z, k = 0.7 - 0.2j, 1e-6
-    gradient, by_start = both(z, PSI0)[1]
+    gradient, by_start = both(z, QUBIT)[1]
     # One program for the gradient and for the values that are compared to it.
     loss = lambda z, psi0: both(z, psi0)[0]
-    along = lambda d: (loss(z + k * d, PSI0) - loss(z - k * d, PSI0)) / (2 * k)
+    along = lambda d: (loss(z + k * d, QUBIT) - loss(z - k * d, QUBIT)) / (2 * k)
     np.testing.assert_allclose(gradient, along(1) - 1j * along(1j), rtol=1e-7)
     unit = np.array([0, 1j])
-    difference = (loss(z, PSI0 + k * unit) - loss(z, PSI0 - k * unit)) / (2 * k)
+    difference = (loss(z, QUBIT + k * unit) - loss(z, QUBIT - k * unit)) / (2 * k)
     np.testing.assert_allclose(-by_start[1].imag, difference, rtol=1e-7)
 
 
