@@ -26,8 +26,8 @@ _DEVICE_AXIS = "samples"
 
 
 class BatchMoments(NamedTuple):
-    """What is known of the samples of a batch. Arrays in an `Averaged` have leading axes
-    for devices and combinations of levels.
+    """What is known of the samples of a batch. Arrays in an `Averaged` have axes for
+    devices, combinations of levels, and numbers.
 
     - `num_good`: the number of good samples.
     - `num_failed`: the number of failed paths. A path that fails on several levels counts
@@ -48,16 +48,6 @@ class BatchMoments(NamedTuple):
     norm: Averaged
     largest: Averaged
     size: Averaged
-
-
-class _ArrayMoments(NamedTuple):
-    """The fields of the same names of `BatchMoments`, for arrays of one shape."""
-
-    mean: Float[Array, "fields combinations ..."]
-    mean_correction: Float[Array, "fields combinations ..."]
-    norm: Float[Array, "fields combinations ..."]
-    largest: Float[Array, "fields combinations ..."]
-    size: Float[Array, "fields combinations ..."]
 
 
 def _moments_on_devices(
@@ -143,26 +133,17 @@ def _moments_on_device(
     failures = jnp.where(is_wanted, samples.num_failed, 0)
     num_failed_on_any = jnp.sum(jnp.max(failures, axis=0))
     fields = samples.averaged.fields
-    # All fields of one shape are summed at once, since fewer operations compile sooner.
-    stacked = jtu.tree_map(lambda *of_fields: jnp.stack(of_fields), *fields.values())
-    leaves, treedef = jtu.tree_flatten(stacked)
-    moments_of_leaves = [_moments_of_array(leaf, good) for leaf in leaves]
-
-    def averaged_of(moment: str) -> Averaged:
-        """One moment of all leaves, with a PyTree like `phi` in each field."""
-        tree = treedef.unflatten([getattr(x, moment) for x in moments_of_leaves])
-        trees = [jtu.tree_map(lambda x, k=k: x[k], tree) for k in range(len(fields))]
-        return Averaged(**dict(zip(fields, trees)))
-
+    # All fields are summed at once, since fewer operations compile sooner.
+    moments = _moments_of_fields(jnp.stack([*fields.values()]), good)
+    averaged_moments = {
+        name: Averaged(**dict(zip(fields, of_fields)))
+        for name, of_fields in moments.items()
+    }
     return BatchMoments(
         num_good=jnp.sum(good),
         num_failed=num_failed_on_any,
         failed_on=jnp.sum(failures, axis=1),
-        mean=averaged_of("mean"),
-        mean_correction=averaged_of("mean_correction"),
-        norm=averaged_of("norm"),
-        largest=averaged_of("largest"),
-        size=averaged_of("size"),
+        **averaged_moments,
     )
 
 
@@ -180,11 +161,11 @@ def _high_and_low_of_sum(
     return high, low
 
 
-def _moments_of_array(
-    x: Float[Array, "fields combinations n ..."], good: Bool[Array, " n"]
-) -> _ArrayMoments:
-    """The moments of one array, whose third axis is that of samples."""
-    is_used = good.reshape(-1, *[1] * (x.ndim - 3))
+def _moments_of_fields(
+    x: Float[Array, "fields combinations n numbers"], good: Bool[Array, " n"]
+) -> dict[str, Float[Array, "fields combinations numbers"]]:
+    """The fields of `BatchMoments` that are an `Averaged`, by their names."""
+    is_used = good[:, None]
     # Sums over no samples are zero, and so are then their means.
     divisor = jnp.maximum(jnp.sum(good), 1)
 
@@ -203,7 +184,7 @@ def _moments_of_array(
     scaled_correction = jnp.sum(scaled, axis=2) / divisor
     # The sum of squared deviations from the corrected mean.
     scaled_squares = jnp.sum(scaled**2, axis=2) - divisor * scaled_correction**2
-    return _ArrayMoments(
+    return dict(
         mean=mean,
         mean_correction=from_unit * scaled_correction,
         norm=from_unit * jnp.sqrt(jnp.maximum(scaled_squares, 0)),

@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import diffrax
-import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, ArrayLike, PRNGKeyArray, PyTree
 
@@ -307,12 +306,11 @@ def _messages_on_law(
         ]
     trial = _trial_with_gaussian_increments(problem, key, devices)
 
-    def is_different(change: np.ndarray, error: np.ndarray) -> np.bool_:
-        return np.any(change > _SURE_OF_LAW * error)
-
-    changes = jtu.tree_map(lambda x, y: np.abs(x - y), estimate.mean, trial.mean)
-    errors = jtu.tree_map(np.hypot, estimate.std_error, trial.std_error)
-    if not any(jtu.tree_leaves(jtu.tree_map(is_different, changes, errors))):
+    own = estimate.vectors
+    other = trial.vectors
+    changes = np.abs(own.mean - other.mean)
+    errors = np.hypot(own.std_error, other.std_error)
+    if not np.any(changes > _SURE_OF_LAW * errors):
         return []
     return [
         "`phi` is not smooth, and its mean changes by up to "
@@ -346,15 +344,10 @@ def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
         return
     # Step sizes are rounded along with times, so errors of the same sign add up over steps.
     fraction = float(precision.eps) * problem.finest_steps
-
-    def is_near_rounding(mean: Any, std_error: Any) -> np.bool_:
-        # Estimates report at least this (see `rounding_floor`). Within twice this floor,
-        # rounding may be most of the standard error.
-        floor = fraction * np.abs(mean)
-        return np.any(std_error <= 2 * floor)
-
-    is_near = jtu.tree_map(is_near_rounding, estimate.mean, estimate.std_error)
-    if any(jtu.tree_leaves(is_near)):
+    # Estimates report at least this (see `rounding_floor`). Within twice this floor,
+    # rounding may be most of the standard error.
+    floor = fraction * np.abs(estimate.vectors.mean)
+    if np.any(estimate.vectors.std_error <= 2 * floor):
         warnings.warn(
             "Rounding errors may be larger than the sampling error: over "
             f"{problem.finest_steps:,} steps in {precision.dtype} they are about "

@@ -4,9 +4,8 @@ import dataclasses
 import functools as ft
 from typing import NamedTuple
 
-import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Float, PRNGKeyArray, PyTree
+from jaxtyping import Float, PRNGKeyArray
 
 from .._custom_types import Devices
 from .._simulation import (
@@ -189,9 +188,9 @@ def _changes_on_same_noise(
             return None
         change = combined_results(trial, Combination.BEST)
         changes = _Changes(
-            sizes=np.abs(_numbers(change.mean)),
-            noise=_numbers(change.std_error),
-            errors=_numbers(estimate.error),
+            sizes=np.abs(change.mean),
+            noise=change.std_error,
+            errors=estimate.vectors.error,
             num_paths=num_paths,
         )
         if changes.are_sure or not changes.are_hidden:
@@ -213,11 +212,12 @@ def _changes_by_same_sampling(
         trial = run(plan, key, devices, start=trial)
         if trial.num_failed > _MOST_FAILED * num_samples * plan.paths_per_sample:
             return None
-        noise = _numbers(trial.std_error)
+        own = estimate.vectors
+        other = trial.vectors
         changes = _Changes(
-            sizes=np.abs(_numbers(trial.mean) - _numbers(estimate.mean)),
-            noise=np.hypot(noise, _numbers(estimate.std_error)),
-            errors=_numbers(estimate.error),
+            sizes=np.abs(other.mean - own.mean),
+            noise=np.hypot(other.std_error, own.std_error),
+            errors=own.error,
             num_paths=trial.num_paths,
         )
         if changes.are_sure or not changes.are_hidden:
@@ -266,8 +266,3 @@ def _with_finer_level(problem: Problem, key: PRNGKeyArray) -> Problem:
         levels=levels,
         weights=weights[None].astype(problem.weights.dtype),
     )
-
-
-def _numbers(tree: PyTree[np.ndarray | np.floating]) -> Float[np.ndarray, " n"]:
-    """All numbers of a PyTree of arrays as one vector."""
-    return np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(tree)])

@@ -11,9 +11,9 @@ from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
 from .._custom_types import Devices
 from .._root_finder import all_finite
-from .._simulation import by_drjit, Level, Problem, state_itself
+from .._simulation import by_drjit, combinations, Level, Problem, state_itself
 from .independent import IndependentPaths
-from .sampling import Averaged, Samples, SamplingPlan
+from .sampling import Averaged, Outputs, Samples, SamplingPlan
 
 
 # The default number of paths in a batch: many, since each call of the kernel takes a while
@@ -38,7 +38,7 @@ def fused_plan(
         )
     plan = sampling.plan(
         jtu.Partial(_samples_of_fused_paths, problem.with_any_steps()),
-        len(problem.levels.h),
+        Outputs.of(problem),
         devices,
         problem.bytes_of_state,
     )
@@ -59,28 +59,18 @@ class FusedPaths:
         # A kernel returns states, and is the same for every $\phi$.
         self._problem = dataclasses.replace(problem, phi=state_itself, at_end=False)
         self._key = key
-        self._last: _NumberedPaths | None = None
         self.num_paths = 0
         self.num_failed = 0
         self.num_stragglers = 0
 
     def __call__(self, first: int, num_samples: int) -> "_Paths":
         """The paths of this number of samples, from sample number `first` on."""
-        # `expectation` asks for the first batch twice: to know the shapes of samples, and
-        # for the samples.
-        numbers = range(first, first + num_samples)
-        if self._last is None or self._last.numbers != numbers:
-            self._last = _NumberedPaths(numbers, self._simulate(numbers))
-        return self._last.paths
-
-    def _simulate(self, numbers: range) -> "_Paths":
-        """The paths of the samples with these numbers."""
-        sample_numbers = np.arange(numbers.start, numbers.stop, dtype=np.uint64)
+        sample_numbers = np.arange(first, first + num_samples, dtype=np.uint64)
         batches = [
             by_drjit(self._problem, self._key, sample_numbers, level)
             for level in range(len(self._problem.levels.h))
         ]
-        self.num_paths += len(numbers) * len(batches)
+        self.num_paths += num_samples * len(batches)
         self.num_failed += sum(int(np.sum(batch.failed)) for batch in batches)
         self.num_stragglers += sum(batch.num_stragglers for batch in batches)
         return _Paths(
@@ -104,13 +94,6 @@ class _Paths(NamedTuple):
     failed: Bool[Array | np.ndarray, "levels n"]
 
 
-class _NumberedPaths(NamedTuple):
-    """Paths, and the numbers of their samples."""
-
-    numbers: range
-    paths: _Paths
-
-
 def _samples_of_fused_paths(
     problem: Problem, paths: _Paths, keys: Key[Array, " n"]
 ) -> Samples:
@@ -132,10 +115,9 @@ def _samples_of_fused_paths(
     phi = jax.vmap(values_on_level)(problem.levels, paths.y)
     is_finite = jax.vmap(jax.vmap(all_finite))(phi)
     failed = jnp.asarray(paths.failed) | ~is_finite
-    # (levels, S, n, m)
-    phi = jnp.swapaxes(phi, 1, 2)
+    values = combinations(problem.weights, phi.reshape(*phi.shape[:2], -1))
     return Samples(
-        averaged=Averaged(problem.unravel_samples(problem.combinations(phi))),
+        averaged=Averaged(values),
         good=~jnp.any(failed, axis=0),
         num_failed=failed,
     )

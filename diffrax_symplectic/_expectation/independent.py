@@ -10,8 +10,15 @@ from jaxtyping import Array, Key
 
 from .._arguments import check_memory, whole_number
 from .._custom_types import Devices
-from .._simulation import Problem, values_of_paths
-from .sampling import AbstractSampling, Averaged, Samples, SamplingPlan, saved_by_name
+from .._simulation import as_vectors, combinations, Problem, values_of_paths
+from .sampling import (
+    AbstractSampling,
+    Averaged,
+    Outputs,
+    Samples,
+    SamplingPlan,
+    saved_by_name,
+)
 
 
 # The default sizes of a batch. On CPUs it keeps all cores busy and fits their caches;
@@ -44,7 +51,7 @@ class IndependentPaths(AbstractSampling):
     def prepare(self, problem, key, devices):
         return self.plan(
             jtu.Partial(_samples_of_independent_paths, problem.with_any_steps()),
-            len(problem.levels.h),
+            Outputs.of(problem),
             devices,
             problem.bytes_of_state,
         )
@@ -52,7 +59,7 @@ class IndependentPaths(AbstractSampling):
     def plan(
         self,
         sampler: Callable[..., Samples],
-        levels: int,
+        outputs: Outputs,
         devices: Devices,
         bytes_of_path: int,
     ) -> SamplingPlan:
@@ -64,7 +71,7 @@ class IndependentPaths(AbstractSampling):
             size = whole_number("batch_size", self.batch_size)
             check_memory("batch_size", size, bytes_of_path, devices[0])
         return SamplingPlan(
-            sampler, num_samples=self.num_paths, batch_size=size, levels=levels
+            sampler, outputs, num_samples=self.num_paths, batch_size=size
         )
 
 
@@ -73,7 +80,7 @@ def _samples_of_independent_paths(problem: Problem, keys: Key[Array, " n"]) -> S
     # (levels, S, n, m) and (levels, n)
     values, failed = values_of_paths(problem, keys)
     return Samples(
-        averaged=Averaged(problem.unravel_samples(problem.combinations(values))),
+        averaged=Averaged(combinations(problem.weights, as_vectors(values))),
         good=~jnp.any(failed, axis=0),
         num_failed=failed,
     )

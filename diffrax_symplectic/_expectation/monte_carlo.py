@@ -1,5 +1,6 @@
 """Averages of any function of a random key."""
 
+import functools as ft
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -15,6 +16,7 @@ from .._arguments import (
     check_real,
     check_takes,
     check_untraced,
+    shapes,
     ShortTraceback,
     whole_number,
 )
@@ -24,15 +26,17 @@ from .._root_finder import all_finite
 from .._simulation import (
     advice_on_failures,
     combinations,
+    Layout,
     level_weights,
     MOST_LEVELS,
+    real_vector,
 )
 from .call import checked_call
 from .estimate import cautions, Expectation
 from .independent import IndependentPaths
 from .progress import NO_METER, Progress
 from .run import Kept, run
-from .sampling import Averaged, Samples
+from .sampling import Averaged, Outputs, Samples
 
 
 def monte_carlo(
@@ -137,9 +141,10 @@ def monte_carlo(
             ]
         check_untraced("`monte_carlo`", programs)
         sampler = jtu.Partial(_samples_of_programs, programs, weights)
+        outputs = _outputs(programs, key, len(weights))
         # A number on each level, or more.
         bytes_of_path = 4 * levels
-        plan = sampling.plan(sampler, levels, devices, bytes_of_path)
+        plan = sampling.plan(sampler, outputs, devices, bytes_of_path)
         plan = plan._replace(digests=dict(fn=digest(programs), order=digest(order)))
         progress.stage("compiling and sampling")
         estimate = run(
@@ -151,6 +156,23 @@ def monte_carlo(
     return estimate
 
 
+def _outputs(
+    programs: list[Traced], key: PRNGKeyArray, num_combinations: int
+) -> Outputs:
+    """The numbers of phi, from the program of each level."""
+    structs = [jax.eval_shape(program, key)[0] for program in programs]
+    layout, *other_layouts = map(Layout.of, structs)
+    if any(other != layout for other in other_layouts):
+        raise ValueError(
+            "`fn` must return a phi of the same structure and shapes on all levels; got "
+            f"{', '.join(map(shapes, structs))}."
+        )
+    # Rounding is that of the least precise numbers.
+    dtypes = {leaf.dtype for leaf in jtu.tree_leaves(structs)}
+    dtype = min(dtypes, key=lambda dtype: jnp.finfo(dtype).bits)
+    return Outputs(layout, len(programs), num_combinations, str(dtype))
+
+
 def _samples_of_programs(
     programs: list[Traced],
     weights: Float[Array | np.ndarray, "combinations levels"],
@@ -158,13 +180,18 @@ def _samples_of_programs(
 ) -> Samples:
     """A sample is a value of the function, with the same random key on all levels, for each
     of which there is a program."""
-    values_and_success = [jax.vmap(program)(keys) for program in programs]
-    # (levels, n, ...) and (levels, n)
-    values, success = jtu.tree_map(lambda *xs: jnp.stack(xs), *values_and_success)
 
-    values = jtu.tree_map(lambda x: combinations(weights, x), values)
+    def vector_and_success(program: Traced, key: PRNGKeyArray) -> tuple[Array, Array]:
+        phi, success = program(key)
+        return real_vector(phi), success
+
+    values_and_success = [
+        jax.vmap(ft.partial(vector_and_success, program))(keys) for program in programs
+    ]
+    # (levels, n, numbers) and (levels, n)
+    values, success = jtu.tree_map(lambda *xs: jnp.stack(xs), *values_and_success)
     return Samples(
-        averaged=Averaged(values),
+        averaged=Averaged(combinations(weights, values)),
         good=jnp.all(success, axis=0),
         num_failed=~success,
     )

@@ -5,7 +5,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.random as jr
 import jax.tree_util as jtu
@@ -15,7 +14,6 @@ from jaxtyping import Array, Key, PRNGKeyArray, PyTree
 
 from .._arguments import check_untraced
 from .._custom_types import Devices
-from .._programs import once_for_each_signature
 from .._simulation import Problem
 from .._solver import has_newton, without_newton
 from .batch import batch_moments, BatchMoments, quick_batch_moments
@@ -77,10 +75,12 @@ def run(
             "on. Pass a smaller number of paths (or replicates), or a smaller `first`."
         )
     batches = _Batches(plan, key, devices)
-    no_moments = batches.moments_of_no_samples(next_sample, end)
+    no_moments = _moments_of_no_samples(plan, next_sample)
     estimate = Expectation(
         moments=(no_moments,),
         key_data=batches.key_data,
+        layout=plan.outputs.layout,
+        dtype=plan.outputs.dtype,
         paths_per_sample=plan.paths_per_sample,
         rounding_floor=plan.rounding_floor,
         sampling=sampling,
@@ -120,9 +120,7 @@ def run(
                 # does not depend on how many devices there are.
                 if _end_of(estimate) == end or needs_no_more_samples():
                     break
-                estimate = _with_batch(
-                    estimate, device_moments, batches.size, end, no_moments.dtypes
-                )
+                estimate = _with_batch(estimate, device_moments, batches.size, end)
                 kept.estimate = estimate
             if progress is not None:
                 share = (_end_of(estimate) - begin) / plan.num_samples
@@ -147,13 +145,11 @@ def _with_batch(
     device_moments: BatchMoments,
     batch_size: int,
     end: int,
-    dtypes: PyTree[str],
 ) -> Expectation:
-    """The estimate with the next batch, of which samples before number `end` count, and
-    which was computed in these `dtypes`."""
+    """The estimate with the next batch, of which samples before number `end` count."""
     begin = _end_of(estimate)
     batch_end = min(begin + batch_size, end)
-    new_moments = _in_float64(device_moments, begin, batch_end, dtypes)
+    new_moments = _in_float64(device_moments, begin, batch_end)
     moments = combined_in_halves((*estimate.moments, new_moments))
     return dataclasses.replace(estimate, moments=moments)
 
@@ -191,8 +187,6 @@ class _Batches:
             self._sampler = _for_all_processes(_by_sweeps_alone(plan.sampler))
         self._simulate_paths = plan.simulate_paths
         self._devices = devices
-        self._struct = plan.struct
-        self._levels = plan.levels
         self._batch_moments: Any = (
             quick_batch_moments if plan.is_quick else batch_moments
         )
@@ -245,29 +239,6 @@ class _Batches:
         num_devices = len(self._devices)
         return [jtu.tree_map(lambda x, k=k: x[k], arrays) for k in range(num_devices)]
 
-    def moments_of_no_samples(self, first: int, end: int) -> Moments:
-        """The moments of no samples, which the batch from sample number `first` on
-        continues."""
-        struct = self._struct
-        if struct is None:
-            struct = _struct_of_mean(
-                self._batch_moments,
-                *self._arguments(first, end),
-            )
-        zeros = jtu.tree_map(lambda x: np.zeros(x.shape), struct)
-        return Moments(
-            begin=first,
-            end=first,
-            num_good=0,
-            num_failed=0,
-            failed_on=(0,) * self._levels,
-            mean=zeros,
-            norm=zeros,
-            largest=zeros,
-            size=zeros,
-            dtypes=jtu.tree_map(lambda x: str(x.dtype), struct.value),
-        )
-
 
 def _is_problem(x: Any) -> bool:
     return isinstance(x, Problem)
@@ -300,19 +271,6 @@ def _for_all_processes(sampler: Callable[..., Samples]) -> Callable[..., Samples
     return lambda keys: sampler(keys)
 
 
-@once_for_each_signature
-def _struct_of_mean(
-    batch_moments: Callable[..., BatchMoments], *arguments: Any
-) -> Averaged:
-    """The shapes and dtypes of the mean of a batch on one device."""
-    # JAX caches this trace and uses it for the first batch.
-    of_batch = eqx.filter_eval_shape(batch_moments, *arguments)
-    # Without the axis of devices.
-    return jtu.tree_map(
-        lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), of_batch.mean
-    )
-
-
 def _samples_of_paths(
     sampler: Callable, paths: PyTree, keys: Key[Array, " n"]
 ) -> Samples:
@@ -320,9 +278,26 @@ def _samples_of_paths(
     return sampler(paths, keys)
 
 
-def _in_float64(
-    device_moments: BatchMoments, begin: int, end: int, dtypes: PyTree[str]
-) -> Moments:
+def _moments_of_no_samples(plan: SamplingPlan, first: int) -> Moments:
+    """The moments of no samples, which the batch from sample number `first` on
+    continues."""
+    outputs = plan.outputs
+    zeros = np.zeros((outputs.num_combinations, outputs.layout.size))
+    averaged = Averaged(**dict.fromkeys(plan.fields, zeros))
+    return Moments(
+        begin=first,
+        end=first,
+        num_good=0,
+        num_failed=0,
+        failed_on=(0,) * outputs.levels,
+        mean=averaged,
+        norm=averaged,
+        largest=averaged,
+        size=averaged,
+    )
+
+
+def _in_float64(device_moments: BatchMoments, begin: int, end: int) -> Moments:
     """The moments of samples `begin` to `end - 1`, in float64."""
     # Single precision could not hold the sum of a mean and its correction.
     wide = jtu.tree_map(lambda x: x.astype(float), device_moments)
@@ -336,7 +311,6 @@ def _in_float64(
         norm=wide.norm,
         largest=wide.largest,
         size=wide.size,
-        dtypes=dtypes,
     )
 
 

@@ -5,10 +5,11 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Int, PRNGKeyArray, PyTree
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from .._custom_types import Devices
-from .._simulation import Problem
+from .._simulation import Layout, Problem
 
 
 # Deviations up to this many roundings of the mean count as rounding errors, since those of
@@ -21,7 +22,8 @@ MOST_SAMPLES = 2**63
 
 class Averaged(NamedTuple):
     """What is averaged of samples: the value of each, whose mean is the estimate, and what
-    else some samplings know of it. Each field has the structure of `phi`, or is `None`.
+    else some samplings know of it. Each field is an array whose last axis is that of all
+    numbers of `phi`, or `None`.
 
     - `value`: the value of a sample.
     - `heaviness`: for a replicate of many paths, the `r` of `Expectation.std_error` over
@@ -32,19 +34,19 @@ class Averaged(NamedTuple):
         minus `value`.
     """
 
-    value: PyTree
-    heaviness: Any = None
-    largest: Any = None
-    plain: Any = None
-    control: Any = None
+    value: Float[Array | np.ndarray, "..."]
+    heaviness: Float[Array | np.ndarray, "..."] | None = None
+    largest: Float[Array | np.ndarray, "..."] | None = None
+    plain: Float[Array | np.ndarray, "..."] | None = None
+    control: Float[Array | np.ndarray, "..."] | None = None
 
     @property
-    def fields(self) -> dict[str, PyTree]:
+    def fields(self) -> dict[str, Any]:
         """The fields that are not `None`."""
         return {name: x for name, x in self._asdict().items() if x is not None}
 
     @property
-    def without_control(self) -> PyTree:
+    def without_control(self) -> Any:
         """The values without a control variate."""
         return self.value if self.plain is None else self.plain
 
@@ -52,8 +54,8 @@ class Averaged(NamedTuple):
 class Samples(eqx.Module):
     """Samples to average.
 
-    - `averaged`: their values, with two leading axes in each array, for combinations of
-        levels and for samples.
+    - `averaged`: their values, with axes for combinations of levels, for samples and for
+        all numbers of `phi`.
     - `good`: which samples are good.
     - `num_failed`: how many paths failed in each, on each level.
     """
@@ -63,14 +65,38 @@ class Samples(eqx.Module):
     num_failed: Int[Array, "levels n"] | Bool[Array, "levels n"]
 
 
+class Outputs(NamedTuple):
+    """The numbers that are averaged.
+
+    - `layout`: how they make PyTrees like `phi`.
+    - `levels`: the number of levels.
+    - `num_combinations`: the number of combinations of levels.
+    - `dtype`: the dtype in which they are computed.
+    """
+
+    layout: Layout
+    levels: int
+    num_combinations: int
+    dtype: str
+
+    @staticmethod
+    def of(problem: Problem) -> "Outputs":
+        """The values of the `phi` of a problem."""
+        num_combinations, levels = problem.weights.shape
+        return Outputs(
+            problem.layout, levels, num_combinations, str(problem.dtype_of_values)
+        )
+
+
 class SamplingPlan(NamedTuple):
     """How samples are taken.
 
     - `sampler`: a callable PyTree that makes one sample for each of several random keys.
+    - `outputs`: the numbers that are averaged.
+    - `fields`: the fields that samples have of `Averaged`.
     - `num_samples`: the most samples, including the samples of an estimate to continue.
     - `batch_size`: the number of samples that each device takes at once.
     - `paths_per_sample`: the number of paths in a sample, on each level.
-    - `levels`: the number of levels.
     - `least_samples`: the fewest samples whose variance is estimated well enough to stop.
     - `least_beside_steps`: the fewest samples after which an estimate without a tolerance
         ends if its sampling error is a small part of that of the steps; `None` if it does
@@ -78,8 +104,6 @@ class SamplingPlan(NamedTuple):
     - `reason`: why this sampling was chosen, for the result.
     - `remainder`: the largest fraction of a standard error that a control variate leaves of
         it, by trials.
-    - `struct`: the shapes and dtypes of what is averaged of one sample, if they are known
-        without a trace.
     - `is_quick`: whether the samples take less time than compiling their program, which is
         then compiled for speed of compilation.
     - `is_fit_quick`: whether the plan holds a fit that took less time than this.
@@ -89,15 +113,15 @@ class SamplingPlan(NamedTuple):
     """
 
     sampler: Callable[..., Samples]
+    outputs: Outputs
     num_samples: int
     batch_size: int
+    fields: tuple[str, ...] = ("value",)
     paths_per_sample: int = 1
-    levels: int = 1
     least_samples: int = 2
     least_beside_steps: int | None = None
     reason: str = ""
     remainder: float = 0.0
-    struct: Averaged | None = None
     is_quick: bool = False
     is_fit_quick: bool = False
     rounding_floor: int = 1

@@ -4,6 +4,7 @@
 - `levels`: step sizes, each half the one before, and extrapolation from them.
 - `problem`: the equation, the function to average and the levels, from the arguments; and
   single steps.
+- `layout`: all numbers of a function's values as one vector, and back.
 - `loop`: the loop over steps, for paths that move in any way, and for independent ones.
 - `engines`: batches of independent paths, by JAX or by a fused kernel.
 """
@@ -22,6 +23,7 @@ from .engines import (
     ENGINES,
     warn_of_stragglers,
 )
+from .layout import as_vectors, Layout
 from .levels import (
     combinations,
     Combination,

@@ -64,7 +64,8 @@ from .arguments import (
     step_numbers,
     traced_phi,
 )
-from .levels import combinations, Level, level_weights, levels_of, MOST_LEVELS
+from .layout import Layout
+from .levels import Level, level_weights, levels_of, MOST_LEVELS
 
 
 # The number that is folded into the key of a sample to draw its `y0` and `args`. The words
@@ -336,48 +337,21 @@ class Problem(eqx.Module):
         """All numbers of `phi` as one vector."""
         return real_vector(self.phi(t, y, self.args))
 
-    def unravel(self, x: Float[Array | np.ndarray, "*axes m"]) -> PyTree[Array]:
-        """Vectors of all numbers of `phi`, as from `values`, in the structure of `phi`,
-        with the other axes of `x` in front."""
-        struct = jax.eval_shape(lambda: self.phi(self.t0, self.y0, self.args))
-        leaves, treedef = jtu.tree_flatten(struct)
-        ends = np.cumsum([leaf.size for leaf in leaves])
-        parts = jnp.split(x, ends[:-1], axis=-1)
-        axes = x.shape[:-1]
-        arrays = [part.reshape(*axes, *leaf.shape) for part, leaf in zip(parts, leaves)]
-        return treedef.unflatten(arrays)
-
-    def combinations(
-        self, x: Float[Array, "levels ..."]
-    ) -> Float[Array, "combinations ..."]:
-        """The combinations of values on all levels, as in `level_weights`."""
-        return combinations(self.weights, x)
-
-    def unravel_samples(
-        self, x: Float[Array | np.ndarray, "combinations S n m"]
-    ) -> PyTree[Array]:
-        """Values of samples in the structure of `phi`, with axes for combinations, samples
-        and times in front; without the axis of times if the mean is at `t1` only."""
-        if self.at_end:
-            return self.unravel(x[:, 0])
-        # (combinations, n, S, m)
-        return self.unravel(jnp.swapaxes(x, 1, 2))
+    @property
+    def layout(self) -> Layout:
+        """How the vectors of samples make PyTrees like `phi`, with an axis of times unless
+        the mean is at `t1` only."""
+        num_times, _ = self.output_shape
+        return Layout.of(self._struct_of_phi, None if self.at_end else num_times)
 
     @property
-    def sample_struct(self) -> PyTree[jax.ShapeDtypeStruct]:
-        """The shapes and dtypes of the values of one sample, for all combinations of
-        levels."""
-        num_times, m = self.output_shape
-        # (combinations, S, n, m) for a single sample.
-        x = np.zeros((len(self.weights), num_times, 1, m), self.dtype_of_values)
-        one_sample = jax.eval_shape(lambda: self.unravel_samples(x))
+    def _struct_of_phi(self) -> PyTree[jax.ShapeDtypeStruct]:
+        return jax.eval_shape(lambda: self.phi(self.t0, self.y0, self.args))
 
-        def without_samples(struct: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
-            num_combinations, _, *other_axes = struct.shape
-            shape = (num_combinations, *other_axes)
-            return jax.ShapeDtypeStruct(shape, struct.dtype)
-
-        return jtu.tree_map(without_samples, one_sample)
+    def unravel(self, x: Float[Array, "*axes m"]) -> PyTree[Array]:
+        """Vectors of all numbers of `phi`, as from `values`, in the structure of `phi`,
+        with the other axes of `x` in front."""
+        return Layout.of(self._struct_of_phi).unravel(x)
 
     @property
     def has_bounded_increments(self) -> bool:

@@ -13,7 +13,13 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._expectation.estimate.cautions import cautions
 from diffrax_symplectic._expectation.estimate.estimate import combined_results
 from diffrax_symplectic._expectation.run import run
-from diffrax_symplectic._expectation.sampling import Averaged, Samples, SamplingPlan
+from diffrax_symplectic._expectation.sampling import (
+    Averaged,
+    Outputs,
+    Samples,
+    SamplingPlan,
+)
+from diffrax_symplectic._simulation import Layout
 from diffrax_symplectic._simulation.levels import Combination
 from diffrax_symplectic._simulation.problem import Problem
 
@@ -157,11 +163,19 @@ def _with_control(shift: float, spread: float = 1.0):
     def sampler(keys):
         x = jax.vmap(jr.normal)(keys)
         control = spread * x + shift
-        own, plain, control = (value[None] for value in (x - control, x, control))
+        own, plain, control = (
+            value[None, :, None] for value in (x - control, x, control)
+        )
         averaged = Averaged(own, plain=plain, control=control)
         return Samples(averaged, jnp.ones(len(keys), bool), jnp.zeros((1, len(keys))))
 
-    plan = SamplingPlan(jax.tree_util.Partial(sampler), 1000, 250)
+    plan = SamplingPlan(
+        jax.tree_util.Partial(sampler),
+        Outputs(Layout.of(0.0), levels=1, num_combinations=1, dtype="float64"),
+        num_samples=1000,
+        batch_size=250,
+        fields=("value", "plain", "control"),
+    )
     return run(plan, KEY, tuple(jax.devices()[:1]))
 
 

@@ -1,7 +1,6 @@
 """What users are warned of in an estimate."""
 
 from collections.abc import Iterator
-from typing import Any
 
 import jax.numpy as jnp
 import jax.tree_util as jtu
@@ -51,15 +50,14 @@ def cautions(estimate: Expectation, tol: float | None, advice: str) -> Iterator[
 
 def _cautions_on_failures(estimate: Expectation, advice: str) -> Iterator[str]:
     """Warns of failed paths that could change the mean by more than its standard error."""
-    changes = jtu.tree_leaves(estimate.failed_error)
-    errors = jtu.tree_leaves(estimate.std_error)
+    vectors = estimate.vectors
     # Without samples both are NaN, which is no reason to return.
-    if all(np.all(change <= error) for change, error in zip(changes, errors)):
+    if np.all(vectors.failed_error <= vectors.std_error):
         return
     if estimate.num_samples == 0:
         consequence = "there is no mean"
     else:
-        largest = largest_error(estimate.failed_error)
+        largest = largest_error(vectors.failed_error)
         consequence = (
             "they are left out of the mean, and could change it by more than its standard "
             f"error, up to {largest:.1e}, which is part of `error`"
@@ -79,15 +77,15 @@ def _cautions_on_failures(estimate: Expectation, advice: str) -> Iterator[str]:
 
 def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
     """Warns of a mean or a standard error that cannot be trusted."""
-    results = jtu.tree_leaves((estimate.mean, estimate.std_error))
-    if not all(np.all(np.isfinite(x)) for x in results):
+    vectors = estimate.vectors
+    if not np.all(np.isfinite([vectors.mean, vectors.std_error])):
         yield (
             "The mean or its standard error is not finite: the averaged values overflow. "
             "Take smaller steps or a more stable solver, and check whether single paths "
             "stay bounded."
         )
     best = combined_results(estimate, Combination.BEST)
-    if any(np.any(x) for x in jtu.tree_leaves(best.dropped)):
+    if np.any(best.dropped):
         yield (
             "A control variate was dropped: its mean over these paths is more than five "
             "standard errors from zero, or not finite. The estimate is crude Monte Carlo. "
@@ -95,10 +93,10 @@ def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
         )
 
     # Paths that count little would not matter.
-    matters = jtu.tree_map(_matters, estimate.std_error, estimate.error)
-    heaviness = jtu.tree_map(np.multiply, best.heaviness, matters)
+    matters = _NEGLIGIBLE_BELOW * vectors.std_error >= vectors.error
+    heaviness = best.heaviness * matters
     place = _place_of_largest(heaviness)
-    r = _flat(heaviness)[place]
+    r = heaviness[place]
     if r > _HEAVY:
         # For sorted paths, each replicate is looked at by itself.
         is_replicate = estimate.paths_per_sample > 1
@@ -113,32 +111,29 @@ def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
         )
 
 
-def _matters(std_error: Any, error: Any) -> Any:
-    return _NEGLIGIBLE_BELOW * std_error >= error
-
-
-def _place_of_largest(values: Any) -> int:
+def _place_of_largest(values: np.ndarray) -> int:
     """The place of the largest of these values, of all numbers of the mean."""
-    return int(np.argmax(np.nan_to_num(_flat(values))))
-
-
-def _flat(tree: Any) -> np.ndarray:
-    return np.concatenate([np.ravel(leaf) for leaf in jtu.tree_leaves(tree)])
+    return int(np.argmax(np.nan_to_num(values)))
 
 
 def _cautions_on_samples(estimate: Expectation) -> Iterator[str]:
     """Warns of samples that are all zero, or all equal."""
-    dtype = _dtype_of_underflow(estimate)
-    if dtype is not None:
+    moments = total(estimate.moments)
+    # Without the control variate, which is not zero where `phi` is.
+    largest_values = moments.size.without_control[Combination.BEST]
+    arrays = jtu.tree_leaves(estimate.layout.unravel(largest_values))
+    smallest = _smallest_accurate(estimate.dtype)
+    # A single entry of an array may well be zero, as a momentum at the start.
+    if any(np.max(array) < smallest for array in arrays):
         yield (
-            f"An output of `phi` is zero, or underflows {dtype}, on all paths. If it "
-            'underflows, use other units, or call `jax.config.update("jax_enable'
+            f"An output of `phi` is zero, or underflows {estimate.dtype}, on all paths. If "
+            'it underflows, use other units, or call `jax.config.update("jax_enable'
             '_x64", True)` first. If it is the indicator of a rare event, the event did '
             "not occur, and the standard error is meaningless. The gradient of an "
             "indicator, or of another step function, is zero wherever it exists: average a "
             "smooth function instead, or difference two estimates."
         )
-    elif not any(np.any(x > 0) for x in jtu.tree_leaves(estimate.variance)):
+    elif not np.any(estimate.vectors.variance > 0):
         yield (
             f"All {estimate.num_samples:,} samples are equal, so the error is unknown. "
             "Check that phi depends on the noise, and a function for `monte_carlo` on its "
@@ -151,67 +146,38 @@ def _cautions_on_steps(estimate: Expectation) -> Iterator[str]:
     if estimate.levels != 2:
         return
 
-    def disagreement(
-        change: Any, noise: Any, finest: Any, spread: Any, size: Any, dtype: str
-    ) -> Any:
-        size_of_change = np.abs(change)
-        rounding = ROUNDING * float(jnp.finfo(dtype).eps) * size[Combination.BEST]
-        is_real = size_of_change > np.maximum(_SURE_OF_CHANGE * noise, rounding)
-        is_large = size_of_change > _MUCH * np.abs(finest)
-        is_seen = size_of_change > _MUCH_OF_SPREAD * spread
-        # The mean may be zero.
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ratio = size_of_change / np.abs(finest)
-        return np.where(is_real & is_large & is_seen, ratio, 0)
-
+    vectors = estimate.vectors
     change = combined_results(estimate, Combination.EXTRAPOLATION)
-    finest = jtu.tree_map(np.add, estimate.mean, estimate.bias)
+    finest = vectors.mean + vectors.bias
+    size_of_change = np.abs(change.mean)
     moments = total(estimate.moments)
     # The largest absolute values of samples, by which their rounding is measured.
-    size = jtu.tree_map(np.fmax, moments.size.value, moments.size.without_control)
-    ratios = jtu.tree_map(
-        disagreement,
-        change.mean,
-        change.std_error,
-        finest,
-        _spread_of_paths(estimate),
-        size,
-        moments.dtypes,
-    )
+    size = np.fmax(moments.size.value, moments.size.without_control)[Combination.BEST]
+    rounding = ROUNDING * float(jnp.finfo(estimate.dtype).eps) * size
+    is_real = size_of_change > np.maximum(_SURE_OF_CHANGE * change.std_error, rounding)
+    is_large = size_of_change > _MUCH * np.abs(finest)
+    is_seen = size_of_change > _MUCH_OF_SPREAD * _spread_of_paths(estimate)
+    # The mean may be zero.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = size_of_change / np.abs(finest)
+    ratios = np.where(is_real & is_large & is_seen, ratios, 0)
     place = _place_of_largest(ratios)
-    if _flat(ratios)[place] > 0:
+    if ratios[place] > 0:
         yield (
             f"The first two steps do not agree{label_of(estimate, place)}: extrapolation "
             "from steps of `dt0` and half of it changes the mean from "
-            f"{_flat(finest)[place]:.3g} to {_flat(estimate.mean)[place]:.3g}. Pass a "
-            "smaller `dt0`, or `levels=3`, which checks the order."
+            f"{finest[place]:.3g} to {vectors.mean[place]:.3g}. Pass a smaller `dt0`, or "
+            "`levels=3`, which checks the order."
         )
 
 
-def _spread_of_paths(estimate: Expectation) -> Any:
+def _spread_of_paths(estimate: Expectation) -> np.ndarray:
     """The standard deviation of the values of a path, or for sorted paths a number that is
     not above it."""
     best = combined_results(estimate, Combination.BEST)
     if estimate.paths_per_sample == 1:
         return best.plain_s
-    return jtu.tree_map(
-        lambda largest, r: least_deviation(largest, r, estimate.paths_per_sample),
-        best.spread,
-        best.heaviness,
-    )
-
-
-def _dtype_of_underflow(estimate: Expectation) -> str | None:
-    """The dtype of an array of `phi` that is zero or underflows on all paths, if there is
-    one."""
-    moments = total(estimate.moments)
-    # Without the control variate, which is not zero where `phi` is.
-    largest_values = jtu.tree_leaves(moments.size.without_control)
-    dtypes = jtu.tree_leaves(moments.dtypes)
-    for largest_value, dtype in zip(largest_values, dtypes):
-        if np.max(largest_value[Combination.BEST]) < _smallest_accurate(dtype):
-            return dtype
-    return None
+    return least_deviation(best.spread, best.heaviness, estimate.paths_per_sample)
 
 
 def _smallest_accurate(dtype: str) -> float:

@@ -3,12 +3,10 @@
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import PyTree
 
 from ..._simulation import Combination
-from ..sampling import Averaged, ROUNDING
+from ..sampling import ROUNDING
 from .moments import Moments
 
 
@@ -54,8 +52,8 @@ def least_deviation(largest: Any, r: Any, n: int) -> Any:
 
 
 class Results(NamedTuple):
-    """What follows from the moments of samples, for one combination of levels. Each field
-    has the structure of `phi`, with a leading axis of times, if any.
+    """What follows from the moments of samples. Arrays have an axis for all numbers of
+    `phi`, and until `of_combination` one for combinations of levels before it.
 
     - `mean`, `std_error`, `variance`: as in `Expectation`.
     - `plain_std_error`: the standard error without a control variate.
@@ -66,75 +64,30 @@ class Results(NamedTuple):
         replicates, that is the mean over the replicates.)
     """
 
-    mean: PyTree[np.ndarray]
-    std_error: PyTree[np.ndarray]
-    plain_std_error: PyTree[np.ndarray]
-    plain_s: PyTree[np.ndarray]
-    variance: PyTree[np.ndarray]
-    heaviness: PyTree[np.ndarray]
-    dropped: PyTree[np.ndarray]
-    spread: PyTree[np.ndarray]
+    mean: np.ndarray
+    std_error: np.ndarray
+    plain_std_error: np.ndarray
+    plain_s: np.ndarray
+    variance: np.ndarray
+    heaviness: np.ndarray
+    dropped: np.ndarray
+    spread: np.ndarray
 
-
-def results_of(
-    moments: Moments,
-    rounding_floor: int,
-    combination: Combination,
-) -> Results:
-    """The results for one combination of levels.
-
-    Each array of `moments.mean` has the shape `(combinations, ...)`, where the dots are the
-    axes of one array of the mean. `rounding_floor` is that of `Expectation`.
-    """
-    treedef = jtu.tree_structure(moments.mean.value)
-    moments_of_arrays = map(
-        _ArrayMoments,
-        _split_by_array(moments.mean),
-        _split_by_array(moments.norm),
-        _split_by_array(moments.largest),
-        jtu.tree_leaves(moments.dtypes),
-    )
-    results_of_arrays = [
-        _results_of_array(moments.num_good, rounding_floor, of_array)
-        for of_array in moments_of_arrays
-    ]
-    # The transpose: the arrays of each field, at this combination, which make a PyTree.
-    trees = [
-        treedef.unflatten([array[combination] for array in arrays])
-        for arrays in zip(*results_of_arrays)
-    ]
-    return Results(*trees)
-
-
-class _ArrayMoments(NamedTuple):
-    """The moments of one array of `phi`, for each combination of levels.
-
-    - `mean`, `norm`, `largest`: as in `Moments`.
-    - `dtype`: the dtype in which the array was computed.
-    """
-
-    mean: Averaged
-    norm: Averaged
-    largest: Averaged
-    dtype: str
-
-
-def _split_by_array(averaged: Averaged) -> list[Averaged]:
-    """What is averaged of each array of `phi`."""
-    fields = averaged.fields
-    arrays_of_fields = map(jtu.tree_leaves, fields.values())
-    return [Averaged(**dict(zip(fields, arrays))) for arrays in zip(*arrays_of_fields)]
+    def of_combination(self, combination: Combination) -> "Results":
+        """The results for one combination of levels."""
+        return Results(*[x[combination] for x in self])
 
 
 @np.errstate(all="ignore")
-def _results_of_array(n: int, rounding_floor: int, moments: _ArrayMoments) -> Results:
-    """The results for an array of `phi` and each combination of levels, from its moments
-    over `n` samples."""
+def results_of(moments: Moments, dtype: str, rounding_floor: int) -> Results:
+    """The results for all combinations of levels. `dtype` and `rounding_floor` are those
+    of `Expectation`."""
+    n = moments.num_good
     mean = moments.mean
     plain_mean = mean.without_control
     # The best combination comes first. All others are differences of values of its size.
     size = np.fmax(np.abs(mean.value[:1]), np.abs(plain_mean[:1]))
-    rounding = rounding_floor * float(jnp.finfo(moments.dtype).eps) * size
+    rounding = rounding_floor * float(jnp.finfo(dtype).eps) * size
     value_spread = _spread_of(
         n, rounding, moments.norm.value, moments.largest.value, mean.heaviness
     )
@@ -159,7 +112,7 @@ def _results_of_array(n: int, rounding_floor: int, moments: _ArrayMoments) -> Re
 
 
 def _results_with_control(
-    results: Results, n: int, rounding: np.ndarray, moments: _ArrayMoments
+    results: Results, n: int, rounding: np.ndarray, moments: Moments
 ) -> Results:
     """The results for values with a control variate, without it where it is dropped."""
     mean = moments.mean

@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, NamedTuple
 
 import equinox as eqx
 import jax.tree_util as jtu
@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from ..._arguments import is_real_number
-from ..._simulation import Combination
+from ..._simulation import Combination, Layout
 from .error_bars import (
     is_off_order,
     largest_if_off_order,
@@ -57,12 +57,16 @@ class Expectation(eqx.Module):
         estimates from files of earlier versions.)
 
     The other fields are what `save` stores beside these, and may change: `moments`,
-    `paths_per_sample`, `rounding_floor`, `digests` and `caveat`.
+    `layout`, `dtype`, `paths_per_sample`, `rounding_floor`, `digests` and `caveat`.
     """
 
     # The moments of batches, with neighbours combined.
     moments: tuple[Moments, ...]
     key_data: np.ndarray
+    # How the numbers of the moments make PyTrees like `phi`, and in which precision they
+    # were computed.
+    layout: Layout = eqx.field(static=True)
+    dtype: str
     paths_per_sample: int = 1
     # The smallest standard error, in units of the rounding of the mean.
     rounding_floor: int = 1
@@ -111,55 +115,46 @@ class Expectation(eqx.Module):
         r"""The estimate, in the structure of $\phi$ and in float64: the mean over the
         samples, extrapolated to step size zero if there are several levels. With `ts` there
         is a leading axis of times. NaN without samples."""
-        return self._results(Combination.BEST).mean
+        return self._tree(self.vectors.mean)
 
     @property
     def std_error(self) -> _Host:
         r"""The standard error of `mean`, from the standard deviation $s$ of the $n$ samples
         and an allowance for values too rare to be among them. It is
 
-        $$ \sqrt{\frac{s^2}{n} \Bigl(1 + \frac{4 r^2}{(1 - r^2)^4}\Bigr) + b^2}, \qquad
+        $$ \sqrt{\frac{s^2}{n} \Bigl(1 + \frac{4 r^2}{(1 - r^2)^4}\Bigr)}, \qquad
         r = \frac{(M - s \sqrt{4.5 \log n})_+}{s \sqrt n}, $$
 
         where $M$ is the largest deviation from the mean. $M$ exceeds
         $s \sqrt{4.5 \log n}$ only for heavy tails, and $r = 1$ if a single sample accounts
         for all of the variance. (For sorted paths, $r$ is also computed for the paths
-        within a replicate, and the larger value is used.) For value functions, $b$ is the
-        part of the mean absolute deviation that only paths show whose noise is wider or
-        pushed to one side; otherwise it is zero. The standard error is never less than the
-        rounding of the mean."""
-        return self._results(Combination.BEST).std_error
+        within a replicate, and the larger value is used.) The standard error is never less
+        than the rounding of the mean."""
+        return self._tree(self.vectors.std_error)
 
     @property
     def variance(self) -> _Host:
         """The variance of a sample."""
-        return self._results(Combination.BEST).variance
+        return self._tree(self.vectors.variance)
 
     @property
     def bias(self) -> _Host | None:
         r"""The discretization error of the finest level, $\mathbb E[\phi_h] - \mathbb
         E[\phi]$, as estimated by extrapolation; `None` with a single level. It has already
         been removed from `mean`: `mean + bias` is the mean of the finest level."""
-        if self.levels == 1:
-            return None
-        return self._results(Combination.BIAS).mean
+        return self._tree(self.vectors.bias)
 
     @property
     def bias_std_error(self) -> _Host | None:
         """The standard error of `bias`."""
-        if self.levels == 1:
-            return None
-        return self._results(Combination.BIAS).std_error
+        return self._tree(self.vectors.bias_std_error)
 
     @property
     def error(self) -> _Host:
         """The error of `mean`, which is printed after it: the root of the sum of squares of
         `std_error`, `failed_error` and `discretization_error`. (With one level this last
         one is unknown, and not included.)"""
-        error = jtu.tree_map(np.hypot, self.std_error, self.failed_error)
-        if self.levels == 1:
-            return error
-        return jtu.tree_map(np.hypot, error, self.discretization_error)
+        return self._tree(self.vectors.error)
 
     @property
     def discretization_error(self) -> _Host | None:
@@ -177,22 +172,7 @@ class Expectation(eqx.Module):
         levels, of order $p + L - 3$. The order $p + L - 2$ of the last extrapolation is not
         checked. So its change is taken for at least as large as if it were of order $p$,
         less two standard errors."""
-        if self.levels == 1:
-            return None
-        extrapolation = self._results(Combination.EXTRAPOLATION).mean
-        off_order = self.off_order
-        if off_order is None:
-            return jtu.tree_map(np.abs, extrapolation)
-        by_first_power = self._results(Combination.BY_FIRST_POWER)
-        size = jtu.tree_map(
-            remaining_error,
-            extrapolation,
-            by_first_power.mean,
-            by_first_power.std_error,
-        )
-        last = self._results(Combination.LAST).mean
-        before = self._results(Combination.BEFORE).mean
-        return jtu.tree_map(largest_if_off_order, off_order, size, last, before)
+        return self._tree(self.vectors.discretization_error)
 
     @property
     def failed_error(self) -> _Host:
@@ -200,26 +180,13 @@ class Expectation(eqx.Module):
         largest deviation of another path's value from the mean. (For sorted paths, that is
         the mean over the replicates.) It does not decrease with more paths, and is NaN if
         there is no other path."""
-        num_drawn = sum(part.end - part.begin for part in self.moments)
-        # A sample of one path is left out if the path fails. A replicate leaves out its
-        # failed paths, which are counted here as a fraction of a sample.
-        num_left_out = num_drawn - self.num_samples
-        num_lost = max(num_left_out, self.num_failed / self.paths_per_sample)
-        fraction = num_lost / max(num_drawn, 1)
-        if self.num_samples == 0:
-            fraction = np.nan
-        largest_deviation = self._results(Combination.BEST).spread
-        return jtu.tree_map(lambda x: fraction * x, largest_deviation)
+        return self._tree(self.vectors.failed_error)
 
     @property
     def off_order(self) -> PyTree[np.ndarray] | None:
         """Whether the changes of the mean from step to step do not fit the order, as in
         `discretization_error`; `None` with fewer than three levels."""
-        if self.levels < 3:
-            return None
-        last = self._results(Combination.LAST)
-        miss = self._results(Combination.MISS)
-        return jtu.tree_map(is_off_order, last.mean, miss.mean, miss.std_error)
+        return self._tree(self.vectors.off_order)
 
     def interval(self, confidence: float = 0.95) -> tuple[_Host, _Host]:
         """The ends of a confidence interval: `mean` plus and minus `error` times the
@@ -239,11 +206,9 @@ class Expectation(eqx.Module):
         from scipy.special import stdtrit
 
         factor = stdtrit(max(self.num_samples - 1, 1), (1 + confidence) / 2)
-        mean = self.mean
-        reach = jtu.tree_map(lambda error: factor * error, self.error)
-        lower = jtu.tree_map(np.subtract, mean, reach)
-        upper = jtu.tree_map(np.add, mean, reach)
-        return lower, upper
+        mean = self.vectors.mean
+        reach = factor * self.vectors.error
+        return self._tree(mean - reach), self._tree(mean + reach)
 
     def merge(self, *others: "Expectation") -> "Expectation":
         """Combines this estimate with others from the same `key` and arguments, but with
@@ -316,7 +281,7 @@ class Expectation(eqx.Module):
         # Only the trials that choose a sampling have none themselves.
         if self.levels == 1 and self.sampling is not None:
             lines.append("not included: the discretization error (see `levels`)")
-        if any(np.any(is_off) for is_off in jtu.tree_leaves(self.off_order)):
+        if self.vectors.is_off_order:
             lines.append(
                 "the changes from step to step do not fit the order: the largest of them "
                 "is taken for the error (take smaller steps)"
@@ -347,15 +312,16 @@ class Expectation(eqx.Module):
         8.6e-05 (sampling 5.1e-05, discretization 6.9e-05)`: its time and its place in the
         PyTree, if there are several, the number, its error, and the parts of the error, if
         there are several."""
-        errors_by_source = {"sampling": _numbers(self.std_error)}
-        if self.levels > 1:
-            errors_by_source["discretization"] = _numbers(self.discretization_error)
+        vectors = self.vectors
+        errors_by_source = {"sampling": vectors.std_error}
+        if vectors.discretization_error is not None:
+            errors_by_source["discretization"] = vectors.discretization_error
         if self.num_failed > 0:
-            errors_by_source["failed paths"] = _numbers(self.failed_error)
-        means = _numbers(self.mean)
-        errors = _numbers(self.error)
+            errors_by_source["failed paths"] = vectors.failed_error
+        means = vectors.mean
+        errors = vectors.error
         lines = []
-        for k, label in enumerate(labels(self)):
+        for k, label in enumerate(self.layout.labels(self.ts)):
             line = f"{_rounded(means[k], errors[k])} ± {errors[k]:.1e}"
             if len(errors_by_source) > 1:
                 sources = [f"{name} {x[k]:.1e}" for name, x in errors_by_source.items()]
@@ -363,10 +329,89 @@ class Expectation(eqx.Module):
             lines.append(f"{label}: {line}" if label else line)
         return lines
 
-    def _results(self, combination: Combination) -> Results:
-        """What follows from the moments for one combination of levels."""
-        whole = total(self.moments)
-        return results_of(whole, self.rounding_floor, combination)
+    @property
+    def vectors(self) -> "Vectors":
+        """All results, each as a vector of all numbers of `phi`."""
+        return _vectors_of(self)
+
+    def _tree(self, x: np.ndarray | None) -> Any:
+        """The numbers of a vector in the structure of `phi`; `None` for `None`."""
+        if x is None:
+            return None
+
+        def scalar_or_array(leaf: np.ndarray) -> np.ndarray | np.floating:
+            return leaf[()]
+
+        return jtu.tree_map(scalar_or_array, self.layout.unravel(x))
+
+
+class Vectors(NamedTuple):
+    """Results of an `Expectation`, under the same names, each as a vector of all numbers of
+    `phi`. With one level `bias`, `bias_std_error` and `discretization_error` are `None`,
+    and with fewer than three levels `off_order` is."""
+
+    mean: np.ndarray
+    std_error: np.ndarray
+    variance: np.ndarray
+    failed_error: np.ndarray
+    bias: np.ndarray | None = None
+    bias_std_error: np.ndarray | None = None
+    discretization_error: np.ndarray | None = None
+    off_order: np.ndarray | None = None
+
+    @property
+    def error(self) -> np.ndarray:
+        error = np.hypot(self.std_error, self.failed_error)
+        if self.discretization_error is None:
+            return error
+        return np.hypot(error, self.discretization_error)
+
+    @property
+    def is_off_order(self) -> bool:
+        """Whether any mean does not fit the order."""
+        return self.off_order is not None and bool(np.any(self.off_order))
+
+
+def _vectors_of(estimate: Expectation) -> Vectors:
+    results = _results_of(estimate)
+    best = results.of_combination(Combination.BEST)
+    num_drawn = sum(part.end - part.begin for part in estimate.moments)
+    # A sample of one path is left out if the path fails. A replicate leaves out its failed
+    # paths, which are counted here as a fraction of a sample.
+    num_left_out = num_drawn - estimate.num_samples
+    num_lost = max(num_left_out, estimate.num_failed / estimate.paths_per_sample)
+    fraction = num_lost / max(num_drawn, 1) if estimate.num_samples > 0 else np.nan
+    vectors = Vectors(best.mean, best.std_error, best.variance, fraction * best.spread)
+    if estimate.levels == 1:
+        return vectors
+    extrapolation = results.of_combination(Combination.EXTRAPOLATION)
+    bias = results.of_combination(Combination.BIAS)
+    vectors = vectors._replace(
+        bias=bias.mean,
+        bias_std_error=bias.std_error,
+        discretization_error=np.abs(extrapolation.mean),
+    )
+    if estimate.levels == 2:
+        return vectors
+    by_first_power = results.of_combination(Combination.BY_FIRST_POWER)
+    last = results.of_combination(Combination.LAST)
+    before = results.of_combination(Combination.BEFORE)
+    miss = results.of_combination(Combination.MISS)
+    size = remaining_error(
+        extrapolation.mean, by_first_power.mean, by_first_power.std_error
+    )
+    off_order = is_off_order(last.mean, miss.mean, miss.std_error)
+    return vectors._replace(
+        discretization_error=largest_if_off_order(
+            off_order, size, last.mean, before.mean
+        ),
+        off_order=off_order,
+    )
+
+
+def _results_of(estimate: Expectation) -> Results:
+    """The results for all combinations of levels."""
+    return results_of(total(estimate.moments), estimate.dtype, estimate.rounding_floor)
 
 
 def _check_file(file: Any, method: str) -> None:
@@ -379,7 +424,7 @@ def _check_file(file: Any, method: str) -> None:
 
 def combined_results(estimate: Expectation, combination: Combination) -> Results:
     """All results for a combination of levels, of which users see some as properties."""
-    return estimate._results(combination)
+    return _results_of(estimate).of_combination(combination)
 
 
 def check_same(one: Expectation, other: Expectation, name: str) -> None:
@@ -398,9 +443,9 @@ def check_same(one: Expectation, other: Expectation, name: str) -> None:
             f"{name} has another `key`. Pass the same `key` for all parts of an "
             "estimate."
         )
-    shapes = jtu.tree_map(np.shape, one.moments[0].mean)
-    other_shapes = jtu.tree_map(np.shape, other.moments[0].mean)
-    if not eqx.tree_equal(shapes, other_shapes):
+    num_combinations = one.moments[0].mean.value.shape
+    other_num_combinations = other.moments[0].mean.value.shape
+    if one.layout != other.layout or num_combinations != other_num_combinations:
         raise ValueError(
             f"{name} has another structure or other shapes. Pass one from the same "
             "function, times and levels."
@@ -423,31 +468,10 @@ def _different_arguments(one: dict[str, str], other: dict[str, str]) -> list[str
     ]
 
 
-def _numbers(tree: PyTree[np.ndarray | np.floating] | None) -> list[float]:
-    """All numbers in a PyTree of arrays."""
-    return [float(x) for leaf in jtu.tree_leaves(tree) for x in np.ravel(leaf)]
-
-
-def labels(estimate: Expectation) -> list[str]:
-    """The time and the place in the PyTree of each number of the mean, such as `t=2,
-    ['energy'][0]`; the empty string for a single number."""
-    found = []
-    for path, leaf in jtu.tree_leaves_with_path(estimate.mean):
-        for index in np.ndindex(np.shape(leaf)):
-            time = ""
-            if estimate.ts is not None:
-                first, *index = index
-                time = f"t={estimate.ts[first]:.7g}"
-            entry = f"[{', '.join(map(str, index))}]" if index else ""
-            place = jtu.keystr(path) + entry
-            found.append(", ".join(filter(None, (time, place))))
-    return found
-
-
 def label_of(estimate: Expectation, place: int) -> str:
     """Which number of the mean stands at this place, in brackets; the empty string for a
     single number."""
-    label = labels(estimate)[place]
+    label = estimate.layout.labels(estimate.ts)[place]
     return f" ({label})" if label else ""
 
 

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import PyTree
 
 from ..sampling import Averaged
 
@@ -16,13 +15,12 @@ class Moments(NamedTuple):
     - `num_good`: the number of good samples.
     - `num_failed`: the number of failed paths, each counted once.
     - `failed_on`: the number of paths that failed on each level.
-    - `mean`: the mean of the good samples. Arrays have a leading axis for combinations of
-        levels.
+    - `mean`: the mean of the good samples. Arrays have axes for combinations of levels and
+        numbers.
     - `norm`: the root of the sum of squared deviations from the mean. (The sum itself would
         overflow or underflow sooner.)
     - `largest`: the largest deviation within a batch.
     - `size`: the largest absolute value.
-    - `dtypes`: the dtype in which each array of `phi` was computed.
     """
 
     begin: int
@@ -34,7 +32,6 @@ class Moments(NamedTuple):
     norm: Averaged
     largest: Averaged
     size: Averaged
-    dtypes: PyTree[str]
 
 
 def combined_in_halves(parts: Iterable[Moments]) -> tuple[Moments, ...]:
@@ -103,5 +100,4 @@ def _moments_of_both(a: Moments, b: Moments) -> Moments:
         norm=jtu.tree_map(norm, a.norm, b.norm, difference),
         largest=jtu.tree_map(np.maximum, a.largest, b.largest),
         size=jtu.tree_map(np.maximum, a.size, b.size),
-        dtypes=b.dtypes,
     )

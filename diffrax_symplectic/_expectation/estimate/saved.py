@@ -7,17 +7,16 @@ import os
 import secrets
 import warnings
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, NamedTuple
 
+import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import PyTree
 
 from ..._arguments import whole_number
-from ..._simulation import level_weights
+from ..._simulation import Layout, level_weights
 from ..sampling import Averaged, MOST_SAMPLES, SAVED_SAMPLINGS
 from .moments import Moments
 
@@ -27,7 +26,13 @@ from .moments import Moments
 _AVERAGED = ("mean", "norm", "largest", "size")
 _NUMBERS = ("begin", "end", "num_good", "num_failed", "failed_on")
 # The fields of an estimate that JSON takes as they are.
-_FIELDS_OF_ESTIMATE = ("paths_per_sample", "rounding_floor", "reason", "tol_reached")
+_FIELDS_OF_ESTIMATE = (
+    "dtype",
+    "paths_per_sample",
+    "rounding_floor",
+    "reason",
+    "tol_reached",
+)
 
 
 class OtherVersion(ValueError):
@@ -103,9 +108,9 @@ def header_of(estimate: Any) -> dict[str, Any]:
     # The names here are those of the files.
     header = {
         "ranges": numbers_of_batches,
-        "structure": _structure_as_json(batch.mean.value),
+        "structure": _structure_as_json(_shapes_in(estimate.layout)),
+        "num_times": estimate.layout.num_times,
         "averaged": list(batch.mean.fields),
-        "dtypes": jtu.tree_leaves(batch.dtypes),
         "sampling": None if sampling is None else type(sampling).__name__,
         "fields": sampling_fields_as_json,
     }
@@ -115,27 +120,19 @@ def header_of(estimate: Any) -> dict[str, Any]:
 
 def arrays_of(estimate: Any) -> dict[str, np.ndarray]:
     """The arrays of an `Expectation` (whose module imports this one), by their names. For
-    example `mean_value_0_1` is leaf 1 of the field `value` of the `mean` of batch 0."""
-    trees = {}
-    for batch, moments in enumerate(estimate.moments):
-        for name in _AVERAGED:
-            for field, tree in getattr(moments, name).fields.items():
-                trees[_name_of_tree(name, field, batch)] = tree
+    example `mean_value_0` is the field `value` of the `mean` of batch 0."""
     arrays = {"key_data": estimate.key_data}
     if estimate.ts is not None:
         arrays["ts"] = estimate.ts
-    for name, tree in trees.items():
-        for leaf, array in enumerate(jtu.tree_leaves(tree)):
-            arrays[_name_of_leaf(name, leaf)] = np.asarray(array)
+    for batch, moments in enumerate(estimate.moments):
+        for name in _AVERAGED:
+            for field, array in getattr(moments, name).fields.items():
+                arrays[_name_of_array(name, field, batch)] = np.asarray(array)
     return arrays
 
 
-def _name_of_tree(name: str, field: str, batch: int) -> str:
+def _name_of_array(name: str, field: str, batch: int) -> str:
     return f"{name}_{field}_{batch}"
-
-
-def _name_of_leaf(tree: str, leaf: int) -> str:
-    return f"{tree}_{leaf}"
 
 
 def fields_from(contents: Contents) -> dict[str, Any]:
@@ -144,37 +141,29 @@ def fields_from(contents: Contents) -> dict[str, Any]:
     estimate has."""
     header, arrays = contents
     _check_counts(header)
-    structure = header["structure"]
-    num_leaves = len(header["dtypes"])
-    # Of each leaf of `phi` there are several arrays, all of one shape.
-    shapes = [arrays[_name_of_leaf("mean_value_0", k)].shape for k in range(num_leaves)]
+    layout = Layout.of(_tree_of(header["structure"]), header["num_times"])
     levels = len(header["ranges"][0][-1])
     # From three levels on, the combinations are the same.
     num_combinations = len(level_weights(1, min(levels, 3)))
-    _check(all(shape[0] == num_combinations for shape in shapes))
-    _check(all(jnp.finfo(dtype) for dtype in header["dtypes"]))
+    _check(bool(jnp.finfo(header["dtype"])))
     _check(arrays["key_data"].dtype == np.uint32)
 
-    def tree(name: str) -> PyTree[np.ndarray]:
-        leaves = [arrays[_name_of_leaf(name, leaf)] for leaf in range(num_leaves)]
-        _check([leaf.shape for leaf in leaves] == shapes)
-        _check(all(leaf.dtype == np.float64 for leaf in leaves))
-        tree = _tree_of(structure, iter(leaves))
-        _check(len(jtu.tree_leaves(tree)) == num_leaves)
-        return tree
+    def array(name: str) -> np.ndarray:
+        _check(arrays[name].shape == (num_combinations, layout.size))
+        _check(arrays[name].dtype == np.float64)
+        return arrays[name]
 
     def averaged(name: str, batch: int) -> Averaged:
         fields = header["averaged"]
-        trees = {field: tree(_name_of_tree(name, field, batch)) for field in fields}
-        return Averaged(**trees)
+        return Averaged(
+            **{field: array(_name_of_array(name, field, batch)) for field in fields}
+        )
 
     def moments_of_batch(batch: int, values: list[Any]) -> Moments:
         numbers: Any = dict(zip(_NUMBERS, values))
         # JSON has lists only.
         numbers["failed_on"] = tuple(numbers["failed_on"])
-        trees: Any = {name: averaged(name, batch) for name in _AVERAGED}
-        dtypes = _tree_of(structure, iter(header["dtypes"]))
-        return Moments(**numbers, **trees, dtypes=dtypes)
+        return Moments(**numbers, **{name: averaged(name, batch) for name in _AVERAGED})
 
     moments = [moments_of_batch(*of_batch) for of_batch in enumerate(header["ranges"])]
     fields = {name: header[name] for name in _FIELDS_OF_ESTIMATE}
@@ -190,6 +179,7 @@ def fields_from(contents: Contents) -> dict[str, Any]:
     return fields | {
         "moments": tuple(moments),
         "key_data": arrays["key_data"],
+        "layout": layout,
         "sampling": _sampling_from(header),
         "ts": arrays["ts"] if "ts" in arrays else None,
     }
@@ -252,10 +242,21 @@ def _number_for_json(x: Any) -> Any:
     return int(x) if isinstance(x, np.integer) else x
 
 
+class _Shape(NamedTuple):
+    """The shape of an array, as a leaf of a PyTree."""
+
+    axes: tuple[int, ...]
+
+
+def _shapes_in(layout: Layout) -> Any:
+    """The PyTree of the shapes of all arrays."""
+    return layout.treedef.unflatten(map(_Shape, layout.shapes))
+
+
 def _structure_as_json(tree: Any) -> Any:
-    """The structure of a PyTree of arrays, for JSON. Each node is a dictionary from its
-    kind to its contents: `{"list": [{"array": 0}, {"none": 0}]}` for `[x, None]`. The
-    contents of an array or of `None` are a zero without a meaning."""
+    """The structure of a PyTree of shapes, for JSON. Each node is a dictionary from its
+    kind to its contents: `{"list": [{"array": [3]}, {"none": 0}]}` for `[x, None]` with `x`
+    of shape `(3,)`. The contents of `None` are a zero without a meaning."""
     if type(tree) is dict and all(type(name) is str for name in tree):
         # Keys are sorted, as JAX sorts them when it takes the leaves.
         children = {name: _structure_as_json(tree[name]) for name in sorted(tree)}
@@ -264,23 +265,24 @@ def _structure_as_json(tree: Any) -> Any:
         return {type(tree).__name__: [_structure_as_json(child) for child in tree]}
     if tree is None:
         return {"none": 0}
-    if isinstance(tree, np.ndarray | np.generic):
-        return {"array": 0}
+    if isinstance(tree, _Shape):
+        return {"array": list(tree.axes)}
     raise ValueError(
         "`save` takes dictionaries with strings as keys, lists, tuples and arrays; phi "
         f"holds a `{type(tree).__name__}`."
     )
 
 
-def _tree_of(structure: Any, leaves: Iterator[Any]) -> Any:
-    """The PyTree with this structure, from `_structure_as_json`, and these leaves."""
+def _tree_of(structure: Any) -> Any:
+    """The PyTree with this structure, from `_structure_as_json`, of arrays of these
+    shapes."""
     # A node has a single entry.
     ((kind, contents),) = structure.items()
     if kind == "dict":
-        return {name: _tree_of(child, leaves) for name, child in contents.items()}
+        return {name: _tree_of(child) for name, child in contents.items()}
     if kind == "none":
         return None
     if kind == "array":
-        return next(leaves)
-    children = [_tree_of(child, leaves) for child in contents]
+        return jax.ShapeDtypeStruct(contents, float)
+    children = [_tree_of(child) for child in contents]
     return children if kind == "list" else tuple(children)

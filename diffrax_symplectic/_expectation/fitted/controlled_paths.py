@@ -8,6 +8,8 @@ import jax.tree_util as jtu
 from jaxtyping import Array, Float, Int, Key
 
 from ..._simulation import (
+    as_vectors,
+    combinations,
     Level,
     mask_like,
     Motion,
@@ -105,13 +107,12 @@ def _samples_of(
 ) -> Samples:
     """The samples from simulated paths, which drew their noise by `laws` of the mixture,
     and whose `control` is a `_Control`."""
-    # (levels, S, n, m)
-    plain = simulated.saved
-    # From (levels, n, S, m) to the same.
-    control = jnp.swapaxes(simulated.control.value, 1, 2).astype(plain.dtype)
-    # (combinations, S, n, m)
-    value = problem.combinations(plain - control)
-    plain = problem.combinations(plain)
+    # (levels, n, numbers)
+    plain = as_vectors(simulated.saved)
+    control = simulated.control.value.reshape(plain.shape).astype(plain.dtype)
+    # (combinations, n, numbers)
+    value = combinations(problem.weights, plain - control)
+    plain = combinations(problem.weights, plain)
 
     # The random variables of all levels are drawn independently, so ratios are multiplied.
     weights = mixture.weights(jnp.sum(simulated.control.log_ratios, axis=0))
@@ -122,27 +123,22 @@ def _samples_of(
     weights = jnp.where(has_failed, 0, weights).astype(plain.dtype)
     value = _weighted(weights, value)
     plain = _weighted(weights, plain)
-    averaged = Averaged(
-        problem.unravel_samples(value),
-        plain=problem.unravel_samples(plain),
-        control=problem.unravel_samples(plain - value),
-    )
     return Samples(
-        averaged,
+        Averaged(value, plain=plain, control=plain - value),
         good=~(has_failed & has_own_law),
         num_failed=simulated.failed & has_own_law,
     )
 
 
 def _weighted(
-    weights: Float[Array, " n"], value: Float[Array, "combinations S n m"]
-) -> Float[Array, "combinations S n m"]:
+    weights: Float[Array, " n"], value: Float[Array, "combinations n numbers"]
+) -> Float[Array, "combinations n numbers"]:
     """Values of which the mean is that of the weighted ones. The values of paths without
     weight, which may have failed, do not matter."""
     weights = weights[:, None]
     shares = weights / jnp.sum(weights)
     weighted = jnp.where(shares > 0, shares * value, 0)
-    mean_of_others = (jnp.sum(weighted, axis=2, keepdims=True) - weighted) / (
+    mean_of_others = (jnp.sum(weighted, axis=1, keepdims=True) - weighted) / (
         1 - shares
     )
     mean_of_others = jnp.where(shares < 1, mean_of_others, 0)

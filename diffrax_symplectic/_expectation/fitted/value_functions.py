@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from ..._arguments import check_memory, check_untraced, whole_number
 from ..._lapack import lapack_in_turn
@@ -27,7 +27,7 @@ from ..estimate import combined_results, Expectation
 from ..run import run
 from ..sampling import (
     AbstractSampling,
-    Averaged,
+    Outputs,
     ROUNDING,
     SamplingPlan,
     saved_by_name,
@@ -95,7 +95,7 @@ class ValueFunctions(AbstractSampling):
         chosen = chosen_basis(problem, self.degree)
         warn_of_long_fit(chosen, stacklevel=_FRAMES_TO_USER)
         basis = chosen.basis
-        struct = problem.sample_struct
+        outputs = Outputs.of(problem)
         functions = _fits(problem, key, basis, range(len(problem.levels.h)))
         mixture = Mixture.of(problem)
 
@@ -106,10 +106,10 @@ class ValueFunctions(AbstractSampling):
             sampler = jtu.Partial(controlled_paths, problem, functions, choice, mixture)
             return SamplingPlan(
                 sampler,
+                outputs,
                 num_samples=num_samples,
                 batch_size=self.batch_size,
-                levels=len(problem.levels.h),
-                struct=Averaged(struct, plain=struct, control=struct),
+                fields=("value", "plain", "control"),
                 # These few paths take less time than compiling their program.
                 is_quick=True,
             )
@@ -154,16 +154,6 @@ def with_half_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
     return plan._replace(sampler=sampler)
 
 
-def _as_one_array(
-    tree: PyTree[np.ndarray | np.floating], output_shape: tuple[int, int]
-) -> Float[np.ndarray, "S m"]:
-    """The arrays of a PyTree in the structure of `phi` as one array of the shape `(S, m)`
-    of `Problem.output_shape`."""
-    num_times, _ = output_shape
-    leaves = [np.reshape(leaf, (num_times, -1)) for leaf in jtu.tree_leaves(tree)]
-    return np.concatenate(leaves, axis=-1)
-
-
 class _Comparison(NamedTuple):
     """The candidates, compared by their trials, with axes for times and components.
 
@@ -192,24 +182,26 @@ def _comparison(
     trials_of_candidates: list[Expectation], output_shape: tuple[int, int]
 ) -> _Comparison:
     """Compares the candidates, by a trial of each."""
+    results_of_candidates = [
+        combined_results(trial, Combination.BEST) for trial in trials_of_candidates
+    ]
     # (C, S, m)
     errors = np.stack(
-        [_as_one_array(trial.std_error, output_shape) for trial in trials_of_candidates]
+        [result.std_error.reshape(output_shape) for result in results_of_candidates]
     )
     # A candidate whose error is NaN has failed.
     errors = np.nan_to_num(errors, nan=np.inf)
     least_errors = np.min(errors, axis=0)
     # The trials have the same paths, so without control their results are the same.
-    first, *_ = trials_of_candidates
-    results = combined_results(first, Combination.BEST)
-    plain_errors = _as_one_array(results.plain_std_error, output_shape)
+    first, *_ = results_of_candidates
+    plain_errors = first.plain_std_error.reshape(output_shape)
     # A fit is used where the error without it is NaN, too.
     is_no_better = least_errors >= plain_errors
     return _Comparison(
         choice=Choice(best=np.argmin(errors, axis=0), used=~is_no_better),
         least_errors=least_errors,
         plain_errors=plain_errors,
-        mean=_as_one_array(first.mean, output_shape),
+        mean=first.mean.reshape(output_shape),
     )
 
 

@@ -25,6 +25,7 @@ from ..._brownian import (
 from ..._custom_types import Y
 from ..._programs import traced
 from ..._simulation import (
+    as_vectors,
     combinations,
     independent_motion,
     Level,
@@ -40,6 +41,7 @@ from ..estimate import heaviness
 from ..sampling import (
     AbstractSampling,
     Averaged,
+    Outputs,
     ROUNDING,
     Samples,
     SamplingPlan,
@@ -141,11 +143,12 @@ class ArrayRQMC(AbstractSampling):
                 points,
                 layout,
             ),
+            Outputs.of(problem),
             num_samples=self.replicates,
             # All paths of a replicate are solved at once, which is a batch already.
             batch_size=1,
+            fields=("value", "heaviness", "largest"),
             paths_per_sample=self.num_paths,
-            levels=len(problem.levels.h),
             least_samples=_LEAST_REPLICATES,
         )
 
@@ -192,17 +195,17 @@ def _samples_of_replicate(
     simulated = simulate(problem, motion_on, _statistics)
     # From (levels, S, 3, m) to (3, levels, S, n, m), with an axis for the samples, of which
     # there is one.
-    mean, r, largest = jnp.moveaxis(simulated.saved[:, :, :, None], 2, 0)
-    mean = problem.combinations(mean)
-    # The largest `r` on any level, for all combinations.
-    r = jnp.broadcast_to(jnp.max(r, axis=0), mean.shape)
-    # The most by which a path can deviate in a combination of levels: the largest
-    # deviations on all of them may be deviations of one path.
-    largest = combinations(abs(problem.weights), largest)
+    statistics = jnp.moveaxis(simulated.saved[:, :, :, None], 2, 0)
+    # (levels, n, numbers)
+    mean, r, largest = map(as_vectors, statistics)
+    mean = combinations(problem.weights, mean)
     averaged = Averaged(
-        problem.unravel_samples(mean),
-        heaviness=problem.unravel_samples(r),
-        largest=problem.unravel_samples(largest),
+        mean,
+        # The largest `r` on any level, for all combinations.
+        heaviness=jnp.broadcast_to(jnp.max(r, axis=0), mean.shape),
+        # The most by which a path can deviate in a combination of levels: the largest
+        # deviations on all of them may be deviations of one path.
+        largest=combinations(abs(problem.weights), largest),
     )
     num_failed = jnp.sum(simulated.failed, axis=1, keepdims=True)
     # Of no paths there is no mean.

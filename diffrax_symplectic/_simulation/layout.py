@@ -1,0 +1,76 @@
+"""All numbers of a PyTree of arrays as one vector, and back."""
+
+import math
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import jax.tree_util as jtu
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+
+class Layout(NamedTuple):
+    """How a vector of all numbers of `phi`, at all times one after another, makes PyTrees
+    like `phi`.
+
+    - `treedef`, `shapes`: the structure of `phi`, and the shapes of its arrays.
+    - `num_times`: the number of times, along the first axis of each array; `None` if arrays
+        have no such axis.
+    """
+
+    treedef: Any
+    shapes: tuple[tuple[int, ...], ...]
+    num_times: int | None = None
+
+    @staticmethod
+    def of(structs: PyTree, num_times: int | None = None) -> "Layout":
+        """The layout for PyTrees with the structure and the shapes of this one."""
+        leaves, treedef = jtu.tree_flatten(structs)
+        return Layout(treedef, tuple(np.shape(leaf) for leaf in leaves), num_times)
+
+    @property
+    def size(self) -> int:
+        """How many numbers there are."""
+        size_of_phi = sum(map(math.prod, self.shapes))
+        return size_of_phi * (1 if self.num_times is None else self.num_times)
+
+    def unravel(self, x: Float[Array | np.ndarray, "*axes size"]) -> PyTree[Array]:
+        """The PyTree of the numbers in a vector. Each array has the other axes of `x` in
+        front."""
+        axes = x.shape[:-1]
+        if self.num_times is not None:
+            axes = (*axes, self.num_times)
+        x = x.reshape(*axes, -1)
+        arrays = []
+        begin = 0
+        for shape in self.shapes:
+            end = begin + math.prod(shape)
+            arrays.append(x[..., begin:end].reshape((*axes, *shape)))
+            begin = end
+        return self.treedef.unflatten(arrays)
+
+    def labels(self, ts: np.ndarray | None) -> list[str]:
+        """The time, of `ts`, and the place in the PyTree of each number, such as `t=2,
+        ['energy'][0]`; the empty string for a single number."""
+        places = []
+        tree = self.treedef.unflatten([np.zeros(shape) for shape in self.shapes])
+        for path, leaf in jtu.tree_leaves_with_path(tree):
+            for index in np.ndindex(leaf.shape):
+                entry = f"[{', '.join(map(str, index))}]" if index else ""
+                places.append(jtu.keystr(path) + entry)
+        if self.num_times is None:
+            return places
+        times = [f"[{k}]" for k in range(self.num_times)]
+        if ts is not None:
+            times = [f"t={t:.7g}" for t in ts]
+        return [
+            f"{time}, {place}" if place else time for time in times for place in places
+        ]
+
+
+def as_vectors(
+    x: Float[Array, "levels times n m"],
+) -> Float[Array, "levels n numbers"]:
+    """For each of `n` samples the numbers at all times as one vector."""
+    x = jnp.swapaxes(x, 1, 2)
+    return x.reshape(*x.shape[:2], -1)
