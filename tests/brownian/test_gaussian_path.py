@@ -13,8 +13,6 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import random as words
 from diffrax_symplectic._brownian.random import normal_from_words
 
-from ..problems import kubo_terms
-
 
 AREA = diffrax.SpaceTimeLevyArea
 
@@ -116,68 +114,6 @@ def test_steps_of_cells_are_sums_and_areas_of_one_motion(dtype):
         Exception, match="`FixedStepBrownianPath` with `cell` must begin"
     ):
         jax.block_until_ready(evaluate(t[0], t[0] + dtype(1.5 * cell)))
-
-
-def test_areas_of_composed_steps_have_their_variances():
-    n, h = 20_000, 0.5
-    path = lambda key: ds.FixedStepBrownianPath((), key, AREA, cell=h / 3)
-    draw = lambda key: path(key).evaluate(h, 2 * h, use_levy=True)
-    inc = jax.jit(jax.vmap(draw))(jr.split(jr.key(1), n))
-    for sample, exact, size in (
-        (inc.W**2, h, np.sqrt(2) * h),
-        (inc.H**2, h / 12, np.sqrt(2) * h / 12),
-        (inc.W * inc.H, 0, h / np.sqrt(12)),
-    ):
-        assert abs(np.mean(sample) - exact) <= 4 * size / np.sqrt(n)
-
-
-Y0 = (jnp.array(0.2), jnp.array(1.0))
-
-
-def _end(path, h, y0=Y0):
-    terms = kubo_terms(path, 0.4)
-    return diffrax.diffeqsolve(terms, diffrax.Heun(), 0.0, 1.0, h, y0).ys[1][-1]
-
-
-def test_solutions_with_steps_h_and_half_of_it_are_strongly_close():
-    # Strong order 1, so the difference halves with h; of independent paths it would not.
-    def differences(key):
-        path = ds.FixedStepBrownianPath((), key, cell=2.0**-7)
-        # One program for all step sizes.
-        return jax.lax.map(lambda h: _end(path, h), 2.0 ** -jnp.arange(4, 8))
-
-    ends = np.asarray(jax.jit(jax.vmap(differences))(jr.split(jr.key(2), 200)))
-    coarse, middle, fine = np.sqrt(np.mean(np.diff(ends, axis=1) ** 2, axis=0))
-    assert coarse < 0.02
-    assert 1.6 < coarse / middle < 2.5 and 1.6 < middle / fine < 2.5
-
-
-@pytest.mark.parametrize("cell", [None, 0.125])
-def test_reverse_mode_sees_the_same_increments(cell):
-    def end(p):
-        path = ds.FixedStepBrownianPath((), jr.key(3), AREA, cell=cell)
-        return _end(path, 0.25, (p, Y0[1]))
-
-    value_and_grad, step = jax.jit(jax.value_and_grad(end)), 1e-6
-    _, reverse = value_and_grad(Y0[0])
-    plus, minus = (value_and_grad(Y0[0] + x)[0] for x in (step, -step))
-    np.testing.assert_allclose(reverse, (plus - minus) / (2 * step), rtol=1e-7)
-
-
-@pytest.mark.parametrize("cell", [None, 0.125])
-def test_backward_in_time_a_solve_returns_to_its_start(cell):
-    path = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((), jr.key(4), cell=cell))
-    terms = kubo_terms(path, 0.4)
-
-    @jax.jit
-    def solve(t0, t1, h, y0):
-        return diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), t0, t1, h, y0).ys
-
-    there = jax.tree.map(lambda x: x[-1], solve(0.0, 1.0, 0.25, Y0))
-    back = solve(1.0, 0.0, -0.25, there)
-    for a, b in zip(back, Y0):
-        np.testing.assert_allclose(a[-1], b, atol=1e-12)
-    assert abs(there[1] - Y0[1]) > 0.1
 
 
 def test_wrappers_make_the_same_step_from_words_as_from_keys():

@@ -3,18 +3,12 @@
 import diffrax
 import jax
 import jax.numpy as jnp
-import jax.random as jr
 import lineax as lx
 import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._adjoint import _undoes_its_steps
-from examples.hard_cases import double_well
-from examples.hard_cases._ensemble import gaussian, weak
-from examples.hard_cases._stationary import stationary_bias, Step
 
-from ..families import slow_except
 from ..problems import as_friction, damped_terms, Given, local_weak_orders, weak_path
 
 
@@ -31,44 +25,21 @@ def _pendula(t, p, q, args):
 
 MATRIX = jnp.array([[1.0, 0.4], [0.4, 0.7]])
 SIGMA = jnp.array([[0.5, 0.1], [-0.3, 0.8]])
-FRICTIONS = {
-    "each": jnp.array([0.7, 0.2]),
-    "matrix": as_friction(MATRIX),
-    "positions": lambda t, q, args: as_friction(MATRIX * jnp.cos(t + q[0] - q[1])),
-}
 
 
-def _one_step(solver, terms, h, y0, t0=0.1):
-    state = solver.init(terms, t0, t0 + h, y0, None)
-    return solver.step(terms, t0, t0 + h, y0, None, state, False)[0]
-
-
-@pytest.mark.parametrize(
-    "make_path, expected",
-    [
-        (gaussian(), [-4.45e-3, -1.02e-3, -2.51e-4]),
-        (weak(), [-3.15e-3, -7.74e-4, -1.96e-4]),
-    ],
-    ids=["Gaussian", "three-point"],
+each_flow = pytest.mark.parametrize(
+    "solver",
+    [ds.BAOAB(), pytest.param(ds.BAOAB(ds.StormerVerlet()), marks=pytest.mark.slow)],
+    ids=repr,
 )
-def test_stationary_bias_of_the_double_well(make_path, expected):
-    step = Step(double_well.langevin_terms, make_path, ds.BAOAB())
-    V = lambda q: double_well.energy(0.0, q)
-    bias = stationary_bias(step, V, double_well.T, [0.4, 0.2, 0.1])
-    np.testing.assert_allclose(bias[:, 0], expected, rtol=1e-2)
 
 
-@pytest.mark.parametrize("solver", [ds.BAOAB(), ds.BAOAB(ds.StormerVerlet())])
-@pytest.mark.parametrize(
-    "friction", slow_except(["matrix"], ["each", "matrix", "positions"])
-)
-def test_local_weak_order_is_two(friction, solver):
-    # The friction does not commute with the covariance of the noise, and may be one that
-    # depends on positions and time.
-    noise = _bath(SIGMA)
-    if friction == "positions":
-        noise = lambda t, p, q, args: jnp.stack([q[0], jnp.sin(q[1] + q[0] * t)])
-    terms = damped_terms(_pendula, FRICTIONS[friction], noise, weak_path(2))
+@each_flow
+def test_local_weak_order_is_two_where_friction_depends_on_positions_and_time(solver):
+    # The friction does not commute with the covariance of the noise.
+    friction = lambda t, q, args: as_friction(MATRIX * jnp.cos(t + q[0] - q[1]))
+    noise = lambda t, p, q, args: jnp.stack([q[0], jnp.sin(q[1] + q[0] * t)])
+    terms = damped_terms(_pendula, friction, noise, weak_path(2))
     y0 = jnp.array([0.3, -0.4]), jnp.array([0.5, 0.1])
     hs = jnp.array([0.004, 0.002, 0.001])
     batch = jax.tree.map(lambda x: x[None], y0)
@@ -76,56 +47,16 @@ def test_local_weak_order_is_two(friction, solver):
     np.testing.assert_allclose(slopes, 3.0, atol=0.1)
 
 
-def test_a_matrix_of_friction_is_that_of_its_own_axes():
-    turn = jnp.linalg.qr(jr.normal(jr.key(0), (3, 3)))[0]
-    rates = jnp.array([0.0, 0.3, 2.0])
-    H0 = lambda t, p, q, args: jnp.sum(p**2 + jnp.sin(args @ q) ** 2) / 2
-    noise = lambda t, p, q, args: -(args @ q)
-    given = Given(jnp.array([0.3, -0.4, 0.1]))
-    p, q = jr.normal(jr.key(1), (2, 3))
-
-    def end(friction, turn):
-        y0 = turn.T @ p, turn.T @ q
-        terms = damped_terms(H0, friction, noise, given)
-        ends = diffrax.diffeqsolve(
-            terms, ds.BAOAB(), 0, 1, 0.25, y0, turn, max_steps=4
-        ).ys
-        return [turn @ x[-1] for x in ends]
-
-    matrix = turn.T @ jnp.diag(rates) @ turn
-    turned = end(as_friction(matrix), turn)
-    np.testing.assert_allclose(turned, end(rates, jnp.eye(3)), atol=1e-13)
-    # A matrix for momenta in a PyTree is an operator on it.
-    kinetic = lambda t, p, q, args: jnp.sum(p["x"] ** 2) / 2
-    y0 = ({"x": jnp.ones((3, 1))},) * 2
-    blocks = {"x": {"x": matrix.reshape(3, 1, 3, 1)}}
-    struct = jax.eval_shape(lambda: y0[0])
-    tag = lx.positive_semidefinite_tag
-    shaped = ds.langevin_terms(kinetic, lx.PyTreeLinearOperator(blocks, struct, tag))
-    p1, _ = _one_step(ds.BAOAB(), shaped, 0.1, y0)
-    x = 0.05 * np.asarray(matrix)
-    expected = np.linalg.solve(np.eye(3) + x, (np.eye(3) - x) @ np.ones(3))
-    np.testing.assert_allclose(p1["x"][:, 0], expected, atol=1e-14)
-
-
-@pytest.mark.parametrize(
-    "solver",
-    [
-        ds.BAOAB(),
-        pytest.param(ds.BAOAB(ds.StormerVerlet()), marks=pytest.mark.slow),
-    ],
-)
-def test_first_and_second_derivatives_by_a_matrix_with_equal_rates(solver):
-    y0 = jnp.ones(2), jnp.zeros(2)
+@pytest.mark.slow
+def test_first_and_second_derivatives_by_a_matrix_with_equal_rates():
+    y0, weights = (jnp.ones(2), jnp.zeros(2)), jnp.array([[1.0, 2.0], [-1.0, 0.5]])
 
     def end(friction):
         given = as_friction(friction)
         terms = damped_terms(_pendula, given, _bath(SIGMA), weak_path(2))
-        adjoint = diffrax.DirectAdjoint()
-        sol = diffrax.diffeqsolve(
-            terms, solver, 0, 1, 0.25, y0, max_steps=4, adjoint=adjoint
-        )
-        return jnp.sum(jnp.stack(sol.ys)[:, -1] * jnp.array([[1.0, 2.0], [-1.0, 0.5]]))
+        state = ds.BAOAB().init(terms, 0.0, 0.5, y0, None)
+        y1, *_ = ds.BAOAB().step(terms, 0.0, 0.5, y0, None, state, False)
+        return jnp.sum(jnp.stack(y1) * weights)
 
     change, k = jnp.array([[0.3, -0.2], [-0.2, 0.5]]), 1e-5
     both = jax.jit(jax.value_and_grad(end))
@@ -136,41 +67,6 @@ def test_first_and_second_derivatives_by_a_matrix_with_equal_rates(solver):
         np.testing.assert_allclose(slope, (above - below) / (2 * k), rtol=1e-8)
         differences = (upper - lower) / (2 * k)
         np.testing.assert_allclose(second(friction), differences, rtol=1e-7, atol=1e-9)
-
-
-@pytest.mark.parametrize("friction", [0.5, jnp.array([0.5, 0.0]), MATRIX])
-def test_momenta_fall_by_the_midpoint_rule_and_rise_again_backward(friction):
-    # Of free particles with masses 1 and 4.
-    H0 = lambda t, p, q, args: jnp.sum(p**2 / jnp.array([1.0, 4.0])) / 2
-    given = as_friction(friction) if jnp.ndim(friction) == 2 else friction
-    terms = ds.langevin_terms(H0, given)
-    y0 = jnp.array([1.0, 2.0]), jnp.zeros(2)
-    rates = np.eye(2) * friction if jnp.ndim(friction) < 2 else np.asarray(friction)
-    x = rates / np.array([1.0, 4.0]) * 0.25 / 2
-    once = np.linalg.solve(np.eye(2) + x, np.eye(2) - x)
-    solver = ds.BAOAB()
-    end = diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.25, y0, max_steps=4).ys
-    expected = np.linalg.matrix_power(once, 4) @ y0[0]
-    np.testing.assert_allclose(end[0][-1], expected, rtol=1e-13)
-    back = tuple(x[-1] for x in end)
-    back = diffrax.diffeqsolve(terms, solver, 1.0, 0.0, -0.25, back, max_steps=4).ys
-    np.testing.assert_allclose([x[-1] for x in back], y0, atol=1e-14)
-
-
-@pytest.mark.parametrize("solver", [ds.BAOAB(), ds.BAOAB(ds.StormerVerlet())])
-def test_one_number_serves_all_momenta_in_their_precision(solver):
-    # Without noise, too.
-    kinetic = lambda p: jnp.sum(p["a"] ** 2) / 2 + jnp.sum(p["b"] ** 2) / 4
-    terms = ds.langevin_terms(lambda t, p, q, args: kinetic(p), np.float64(0.8))
-    p = {"a": jnp.ones(2, jnp.float32), "b": jnp.full((3, 1), 2, jnp.float32)}
-    t0, t1 = jnp.float32(0), jnp.float32(0.5)
-    state = solver.init(terms, t0, t1, (p, p), None)
-    p1, _ = solver.step(terms, t0, t1, (p, p), None, state, False)[0]
-    # The velocities of the second are half as large.
-    for name, mass in (("a", 1), ("b", 2)):
-        assert p1[name].dtype == jnp.float32
-        expected = p[name] * np.exp(-0.4 / mass)
-        np.testing.assert_allclose(p1[name], expected, rtol=6e-3)
 
 
 def test_what_has_no_friction_is_refused():
@@ -229,26 +125,6 @@ def test_states_that_are_not_real_floating_point_are_refused():
             ds.BAOAB().init(terms, 0.0, 0.1, y0, None)
 
 
-def test_one_evaluation_of_the_forces_in_a_step():
-    calls = []
-
-    def H0(t, p, q, args):
-        potential = jax.pure_callback(
-            lambda q: calls.append(0) or np.sum(np.asarray(q) ** 2) / 2,
-            jax.ShapeDtypeStruct((), q.dtype), jax.lax.stop_gradient(q),
-        )  # fmt: skip
-        force = jax.custom_jvp(lambda q: potential)
-        force.defjvp(lambda x, v: (potential, potential * jnp.sum(v[0])))
-        return jnp.sum(p**2) / 2 + force(q)
-
-    terms = ds.langevin_terms(H0, 1.0, 1.0, weak_path(2), structure="separable")
-    y0 = jnp.ones(2), jnp.ones(2)
-    sol = diffrax.diffeqsolve(terms, ds.BAOAB(), 0, 1, 0.1, y0, max_steps=16)
-    jax.block_until_ready(sol.ys)
-    assert sol.stats["num_steps"] == 10
-    assert len(calls) == 11
-
-
 def test_after_a_jump_the_forces_are_new():
     terms = ds.langevin_terms(_pendula, 0.5, 0.8, Given(jnp.array([0.3, 0.1])))
     solver, y0 = ds.BAOAB(), (jnp.ones(2), jnp.zeros(2))
@@ -257,29 +133,6 @@ def test_after_a_jump_the_forces_are_new():
     fresh = step(solver.init(terms, 0.0, 0.1, y0, None), False)
     np.testing.assert_array_equal(jax.jit(step)(state, True), fresh)
     assert np.max(np.abs(np.subtract(step(state, False), fresh))) > 1e-3
-
-
-def test_gradients_may_walk_back_along_the_solution():
-    solver = ds.BAOAB()
-    assert _undoes_its_steps(solver)
-    assert _undoes_its_steps(ds.BAOAB(ds.StormerVerlet()))
-    assert not _undoes_its_steps(ds.BAOAB(ds.SRKw4()))
-    H0 = lambda t, p, q, args: _pendula(t, args * p, args * q, None)
-    terms = ds.langevin_terms(H0, as_friction(MATRIX), 0.8, weak_path(2))
-
-    def end(y0, args, adjoint):
-        sol = diffrax.diffeqsolve(
-            terms, solver, 0, 2, 0.1, y0, args, adjoint=adjoint, max_steps=32
-        )
-        return jnp.sum(sol.ys[0][-1] ** 2) + sol.ys[1][-1, 0]
-
-    y0, args = (jnp.ones(2), jnp.array([0.2, 0.4])), jnp.array([1.0, 0.8])
-    grad = jax.jit(jax.grad(end, argnums=(0, 1)), static_argnums=2)
-    ours = grad(y0, args, ds.ReversingAdjoint(checkpoints=4))
-    theirs = grad(y0, args, diffrax.RecursiveCheckpointAdjoint())
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11), ours, theirs
-    )
 
 
 def test_backward_in_time_a_step_is_undone():

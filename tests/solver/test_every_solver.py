@@ -111,11 +111,21 @@ def take_step(solver, terms, t0, t1, y0, args):
     return y1, result
 
 
-# Other members of a family, and a solver within another one, are slow.
+# One for each kind of step. Others are of the same blocks with other numbers, which
+# `test_tableau` knows.
 QUICK_STEPS = [
     repr(solver)
-    for solver in (*DEFAULTS, *SPLIT)
-    if getattr(solver, "flow", None) is None or isinstance(solver, ds.LinearFlow)
+    for solver in (
+        *(
+            ds.ImplicitMidpoint(),
+            ds.SRKw2(),
+            ds.StormerVerlet(),
+            ds.SRKs3(),
+            ds.SRKs4(),
+        ),
+        *(ds.NinomiyaVictoir(), ds.PlateauGauss(), ds.LevyAreaMidpoint(), ds.BAOAB()),
+        SPLIT[-1],
+    )
 ]
 
 # By the scope all tests of one solver follow each other, in the process that has compiled
@@ -492,24 +502,6 @@ def test_strong_order(solver):
         assert low <= order <= high, (kind, order)
 
 
-@each(TABLE)
-def test_coefficients_are_symplectic_and_of_the_claimed_order(solver):
-    if not hasattr(solver, "tableau"):
-        return
-    tableau, record = solver.tableau, solver.record
-    worst = [np.max(np.abs(ds.symplectic_residuals(tableau)))]
-    order = min(record.order("weak", True), 2)
-    worst += map(abs, ds.weak_order_residuals(tableau, order).values())
-    if record.strong is not None:
-        worst += map(abs, ds.strong_order_residuals(tableau).values())
-    assert max(worst) <= 1e-14
-    assert solver.stage_vectors(5) == tuple(
-        n
-        for block in make_plan(tableau.flatten()).blocks
-        if (n := sum(len(group) for group in block.unknown))
-    )
-
-
 @each([*DEFAULTS, *SPLIT])
 def test_own_paths_hold_what_a_step_needs(solver):
     system = SYSTEMS[solver.structure]
@@ -560,6 +552,24 @@ def test_bad_shapes_keys_and_wants_are_refused():
         path((2,), 3)  # pyright: ignore
     with pytest.raises(ValueError, match="`shape`"):
         path(3, jr.key(0))  # pyright: ignore
+
+
+def test_solvers_say_what_they_need():
+    assert ds.ImplicitMidpoint().minimal_levy_area is diffrax.AbstractBrownianIncrement
+    for kinds, increment in (
+        ((ds.SRKs4, ds.PlateauGauss), diffrax.AbstractSpaceTimeLevyArea),
+        ((ds.SRKw5, ds.AdditiveGauss, ds.NinomiyaVictoir), ds.WeakIncrement),
+        ((ds.PlateauVerlet,), ds.PlateauIncrement),
+        ((ds.LevyAreaMidpoint,), ds.LevyAreaIncrement),
+    ):
+        for kind in kinds:
+            assert kind().minimal_levy_area is increment
+    for solver in DEFAULTS:
+        if hasattr(solver, "tableau"):
+            # The unknown vectors of each system of equations.
+            blocks = make_plan(solver.tableau.flatten()).blocks
+            sizes = (sum(map(len, block.unknown)) for block in blocks)
+            assert solver.stage_vectors(5) == tuple(n for n in sizes if n)
 
 
 def test_solvers_print_in_a_line():

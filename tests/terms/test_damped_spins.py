@@ -10,7 +10,7 @@ import pytest
 import diffrax_symplectic as ds
 from examples import warm_spins
 
-from ..problems import Given, local_weak_orders, slope, weak_path
+from ..problems import Given, slope, weak_path
 from .test_spins import _problem, H0, noise
 
 
@@ -33,18 +33,6 @@ def test_solutions_push_forward_to_the_landau_lifshitz_equation():
         )
 
 
-def test_gilberts_form_is_the_same_equation_in_another_time():
-    s0, args = _problem(jr.key(0), 1, 3)
-    s, damping = s0 / jnp.linalg.norm(s0), 0.3
-    y = ds.to_spinors(s)
-    drift, _ = ds.spin_terms(H0, noise, weak_path(3), damping).terms
-    _, velocity = jax.jvp(ds.from_spinors, (y,), (drift.vf(0.4, y, args),))
-    velocity = velocity / (1 + damping**2)
-    turn = jnp.cross(s, jax.grad(H0, 1)(0.4, s, args))
-    expected = turn + damping * jnp.cross(s, velocity)
-    np.testing.assert_allclose(velocity, expected, atol=1e-14)
-
-
 def test_dampings_fit_lattices_of_spins_and_take_their_precision():
     s = _problem(jr.key(0), 6, 3, jnp.float32)[0]
     alpha = np.linspace(0.0, 1.0, 6)
@@ -60,58 +48,30 @@ def test_dampings_fit_lattices_of_spins_and_take_their_precision():
         np.testing.assert_array_equal(shaped.reshape(6, 2), flat)
 
 
-# One solver for each kind of step: one system of equations, several, and those that make
-# vector fields of brackets.
+# The last makes vector fields of brackets.
 @pytest.mark.parametrize(
-    "solver, dtype, bound",
+    "solver",
     [
-        (ds.ImplicitMidpoint(), jnp.float64, 1e-13),
-        pytest.param(ds.ImplicitMidpoint(), jnp.float32, 1e-5, marks=pytest.mark.slow),
-        pytest.param(ds.NinomiyaVictoir(), jnp.float64, 1e-13, marks=pytest.mark.slow),
-        pytest.param(ds.PlateauGauss(), jnp.float64, 1e-13, marks=pytest.mark.slow),
+        ds.ImplicitMidpoint(),
+        pytest.param(ds.PlateauGauss(), marks=pytest.mark.slow),
     ],
-    ids=[
-        "ImplicitMidpoint",
-        "float32",
-        "NinomiyaVictoir",
-        "PlateauGauss",
-    ],
+    ids=repr,
 )
-def test_length_is_kept_for_a_thousand_random_systems(solver, dtype, bound):
+def test_length_is_kept_for_a_thousand_random_systems(solver):
     def change(key):
-        k_problem, k_h, k_W, k_A, k_alpha = jr.split(key, 5)
-        s0, args = _problem(k_problem, 2, 3, dtype)
-        h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.2)))
-        W = jnp.sqrt(h) * jnp.clip(jr.normal(k_W, (3,), dtype), -2.5, 2.5)
-        A = h / 2 * jr.normal(k_A, (3, 3), dtype)
-        given = Given(W, H=W[::-1] / 4, A=A - A.T, two_point=jnp.sign(W))
-        alpha = jr.uniform(k_alpha, (2,), dtype)
+        k_problem, k_h, k_W, k_alpha = jr.split(key, 4)
+        s0, args = _problem(k_problem, 2, 3)
+        h = jnp.exp(jr.uniform(k_h, (), float, jnp.log(1e-3), jnp.log(0.2)))
+        W = jnp.sqrt(h) * jnp.clip(jr.normal(k_W, (3,)), -2.5, 2.5)
+        given, alpha = Given(W, H=W[::-1] / 4), jr.uniform(k_alpha, (2,))
         terms = ds.spin_terms(H0, noise, given, damping=alpha)
         y0 = ds.to_spinors(s0)
-        y1, *_ = solver.step(terms, 0 * h, h, y0, args, None, False)
+        y1, *_ = solver.step(terms, 0.0, h, y0, args, None, False)
         before, after = (jnp.linalg.norm(ds.from_spinors(y), axis=-1) for y in (y0, y1))
         return jnp.max(jnp.abs(after / before - 1))
 
     changes = jax.jit(jax.vmap(change))(jr.split(jr.key(0), 1000))
-    assert changes.dtype == dtype
-    assert jnp.max(changes) <= bound
-
-
-@pytest.mark.slow
-def test_ninomiya_victoir_keeps_weak_order_two_with_damping():
-    path = weak_path(2, two_point=True)
-    terms = ds.spin_terms(H0, noise, path, damping=0.6)
-    s0, args = jax.vmap(lambda key: _problem(key, 1, 2))(jr.split(jr.key(5), 2))
-
-    def fn(t, y, args):
-        s = ds.from_spinors(y)[0]
-        return jnp.stack([s[2], s[0] * s[1], jnp.exp(s[1] / 2)])
-
-    hs = np.array([0.008, 0.004, 0.002, 0.001])
-    y0 = ds.to_spinors(s0)
-    solver = ds.NinomiyaVictoir()
-    slopes = local_weak_orders(terms, solver, y0, args, hs, order=2, fn=fn)
-    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
+    assert jnp.max(changes) <= 1e-13
 
 
 @pytest.mark.slow
@@ -126,45 +86,6 @@ def test_stationary_law_of_one_spin_is_that_of_gibbs_up_to_the_square_of_the_ste
     assert np.max(np.abs(bias[-1])) <= 1e-3
     for column in bias.T:
         assert abs(slope(hs, column) - 2) <= 0.15
-
-
-def test_without_noise_spins_come_to_rest_along_their_field():
-    field = lambda t, s, args: -jnp.sum(s @ jnp.array([0.0, 0.6, 0.8]))
-    still = lambda t, s, args: 0 * s
-    s0 = jnp.array([[1.0, 0.0, 0.0], [0.0, -2.0, 0.5]])
-    terms = ds.spin_terms(
-        field, still, ds.WeakBrownianPath((2, 3), jr.key(0)), damping=0.5
-    )
-    end = diffrax.diffeqsolve(
-        terms, ds.ImplicitMidpoint(), 0, 60, 0.2, ds.to_spinors(s0)
-    ).ys
-    s1 = ds.from_spinors(end)[-1]
-    expected = jnp.linalg.norm(s0, axis=-1)[:, None] * jnp.array([0.0, 0.6, 0.8])
-    np.testing.assert_allclose(s1, expected, atol=1e-10)
-
-
-@pytest.mark.slow
-def test_gradients_with_respect_to_damping_and_parameters():
-    H = lambda t, s, args: -jnp.sum(args * s[..., 2]) - jnp.sum(s[1:] * s[:-1])
-    s0, _ = _problem(jr.key(0), 4, 1)
-    path = ds.WeakBrownianPath((4, 3), jr.key(0))
-    weights = np.random.default_rng(1).normal(size=(4, 3))
-
-    def end(alpha, args):
-        terms = ds.spin_terms(H, lambda t, s, args: 0.3 * s, path, damping=alpha)
-        solver = ds.ImplicitMidpoint()
-        sol = diffrax.diffeqsolve(terms, solver, 0, 1, 0.25, ds.to_spinors(s0), args)
-        return jnp.sum(ds.from_spinors(sol.ys)[-1] * weights)
-
-    # One program for the gradient and for the values that are compared to it.
-    both = jax.jit(jax.value_and_grad(end, argnums=(0, 1)))
-    k = 1e-5
-    gradients = both(0.4, 0.7)[1]
-    slopes = [
-        (both(0.4 + k, 0.7)[0] - both(0.4 - k, 0.7)[0]) / (2 * k),
-        (both(0.4, 0.7 + k)[0] - both(0.4, 0.7 - k)[0]) / (2 * k),
-    ]
-    np.testing.assert_allclose(gradients, slopes, rtol=1e-8)
 
 
 def test_dampings_that_are_none_are_refused():
@@ -191,10 +112,8 @@ def test_dampings_that_are_none_are_refused():
     @jax.vmap
     def run(alpha):
         terms = ds.spin_terms(H0, noise, path, damping=alpha)
-        sol = diffrax.diffeqsolve(
-            terms, ds.ImplicitMidpoint(), 0, 0.2, 0.1, y0, args, throw=False
-        )
-        return sol.result == diffrax.RESULTS.successful
+        at = terms, 0.0, 0.1, y0, args, None, False
+        return ds.ImplicitMidpoint().step(*at)[-1] == diffrax.RESULTS.successful
 
     np.testing.assert_array_equal(
         run(jnp.array([0.5, -0.5, jnp.nan, jnp.inf])), [True, False, False, False]

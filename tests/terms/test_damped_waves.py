@@ -79,11 +79,10 @@ def test_two_amplitudes_are_a_spin_with_twice_the_damping():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-14), spin, wave)
 
 
-@pytest.mark.parametrize("energy", [_anisotropy, _field_and_square, _phases])
-def test_density_of_gibbs_solves_the_equation_of_fokker_and_planck(energy):
+def test_density_of_gibbs_solves_the_equation_of_fokker_and_planck():
     # div(a rho) = 1/2 sum_k div(b_k div(b_k rho)) for the Stratonovich fields a and b_k.
     T = 0.6
-    terms = ds.wave_terms(energy, _thermal, _path(3), ALPHA)
+    terms = ds.wave_terms(_phases, _thermal, _path(3), ALPHA)
 
     def field(control):
         def velocity(x):
@@ -99,7 +98,7 @@ def test_density_of_gibbs_solves_the_equation_of_fokker_and_planck(energy):
         return lambda x: jnp.trace(jax.jacfwd(flow)(x))
 
     def rho(x):
-        return jnp.exp(-energy(0.4, ds.from_pair((x[:3], x[3:])), T) / T)
+        return jnp.exp(-_phases(0.4, ds.from_pair((x[:3], x[3:])), T) / T)
 
     def both(x):
         drift = divergence(field(None), rho)(x)
@@ -115,120 +114,19 @@ def test_density_of_gibbs_solves_the_equation_of_fokker_and_planck(energy):
     np.testing.assert_allclose(drift, diffusion, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize(
-    "solver, dtype, bound",
-    [
-        (ds.ImplicitMidpoint(), jnp.float64, 1e-13),
-        pytest.param(ds.ImplicitMidpoint(), jnp.float32, 1e-5, marks=pytest.mark.slow),
-        pytest.param(ds.NinomiyaVictoir(), jnp.float64, 1e-13, marks=pytest.mark.slow),
-    ],
-    ids=["ImplicitMidpoint", "float32", "NinomiyaVictoir"],
-)
-def test_length_is_kept_in_five_hundred_random_steps(solver, dtype, bound):
+def test_length_is_kept_in_five_hundred_random_steps():
     def change(key):
         k_psi, k_h, k_W = jr.split(key, 3)
-        psi0 = jr.normal(k_psi, (2, 3), (1j * jnp.zeros((), dtype)).dtype)
-        h = jnp.exp(jr.uniform(k_h, (), dtype, jnp.log(1e-3), jnp.log(0.1)))
-        W = jnp.sqrt(h) * jnp.clip(jr.normal(k_W, (2, 3, 3), dtype), -2.5, 2.5)
-        given = Given(W, two_point=jnp.sign(W))
-        alpha = jnp.array([0.2, 0.5], dtype)
-        terms = ds.wave_terms(_field_and_square, _thermal, given, alpha)
-        y0, T = ds.to_pair(psi0), jnp.asarray(0.2, dtype)
-        y1, *_ = solver.step(terms, 0 * h, h, y0, T, None, False)
+        h = jnp.exp(jr.uniform(k_h, (), float, jnp.log(1e-3), jnp.log(0.1)))
+        W = jnp.sqrt(h) * jnp.clip(jr.normal(k_W, (2, 3, 3)), -2.5, 2.5)
+        alpha, y0 = jnp.array([0.2, 0.5]), ds.to_pair(_random(k_psi, 2, 3))
+        terms = ds.wave_terms(_field_and_square, _thermal, Given(W), alpha)
+        y1, *_ = ds.ImplicitMidpoint().step(terms, 0.0, h, y0, 0.2, None, False)
         lengths = [jnp.linalg.norm(ds.from_pair(y), axis=-1) for y in (y0, y1)]
         return jnp.max(jnp.abs(lengths[1] / lengths[0] - 1))
 
     changes = jax.jit(jax.vmap(change))(jr.split(jr.key(0), 500))
-    assert changes.dtype == dtype
-    assert jnp.max(changes) <= bound
-
-
-def test_at_infinite_temperature_a_step_keeps_the_uniform_law_exactly():
-    # Without energy a step of the midpoint rule is a unitary matrix for each increment.
-    no_energy = lambda t, psi, args: jnp.zeros(())
-    given = Given(0.3 * jr.normal(jr.key(1), (3, 3)))
-    terms = ds.wave_terms(no_energy, _thermal, given, ALPHA)
-
-    def after(psi):
-        y0 = ds.to_pair(psi)
-        step = ds.ImplicitMidpoint().step(terms, 0.0, 0.1, y0, 1.0, None, False)
-        return ds.from_pair(step[0])
-
-    U = jax.jit(jax.vmap(after, out_axes=1))(jnp.eye(3, dtype=complex))
-    np.testing.assert_allclose(jnp.conj(U.T) @ U, jnp.eye(3), atol=1e-13)
-    psi = _random(jr.key(2), 3)
-    np.testing.assert_allclose(jax.jit(after)(psi), U @ psi, atol=1e-13)
-
-
-def _by_quadrature(energy, T, n=16):
-    """<H> over the unit sphere of C^3, whose squares |psi_j|^2 are uniform on a triangle.
-    The energy must not depend on the phase of the whole vector."""
-    x, weights = np.polynomial.legendre.leggauss(n)
-    x, weights = (x + 1) / 2, weights / 2
-    # Squares u, (1 - u) v and the rest, of density proportional to 1 - u. Roots of these
-    # are smooth in the angles whose squared sines they are.
-    u, v = np.sin(np.pi / 2 * x) ** 2, np.sin(np.pi / 2 * x) ** 2
-    w = weights * np.pi / 2 * np.sin(np.pi * x)
-    phases = 2 * np.pi * np.arange(n) / n
-    a, b, one, two = np.meshgrid(u, v, phases, phases, indexing="ij")
-    squares = np.stack([a, (1 - a) * b, (1 - a) * (1 - b)], axis=-1)
-    angles = np.stack([one, np.zeros_like(one), two], axis=-1)
-    psi = jnp.asarray(np.sqrt(np.abs(squares)) * np.exp(1j * angles)).reshape(-1, 3)
-    H = jax.vmap(lambda psi: energy(0.0, psi, None))(psi)
-    density = (w[:, None] * w * (1 - u)[:, None])[:, :, None, None] * np.ones((n, n))
-    rho = jnp.exp(-H / T) * density.ravel()
-    return jnp.sum(rho * H) / jnp.sum(rho)
-
-
-# The equation has this law by the test above, exactly.
-@pytest.mark.slow
-def test_mean_energies_at_four_temperatures_are_those_of_gibbs():
-    Ts = jnp.array([0.15, 0.4, 1.0, 3.0])
-    # D (S^z)^2 is |psi_1|^2 + |psi_3|^2 = x, of density 2 x on (0, 1).
-    x = np.linspace(0, 1, 20001)
-    rho = x * np.exp(-x / np.asarray(Ts)[:, None])
-    exact = np.trapezoid(x * rho, x) / np.trapezoid(rho, x)
-    found = [_by_quadrature(_anisotropy, T) for T in Ts]
-    np.testing.assert_allclose(found, exact, atol=1e-6)
-    fine = [_by_quadrature(_field_and_square, T, n=20) for T in Ts]
-    found = [_by_quadrature(_field_and_square, T) for T in Ts]
-    np.testing.assert_allclose(found, fine, atol=1e-6)
-
-    paths, steps, h = 32, 200, 0.1
-
-    def energy(t, psi, args):
-        # Of one of the two systems.
-        _, share = args
-        mixed = share * _anisotropy(t, psi, args)
-        return mixed + (1 - share) * _field_and_square(t, psi, args)
-
-    def thermal(t, psi, args):
-        T, _ = args
-        return _thermal(t, psi, T)
-
-    def mean_over_time(T, share, key):
-        path = ds.WeakBrownianPath((3, 3), key)
-        terms = ds.wave_terms(energy, thermal, path, ALPHA)
-
-        def saved(t, y, args):
-            return energy(t, ds.from_pair(y), args)
-
-        psi0 = jnp.zeros(3, complex).at[1].set(1.0)
-        sol = diffrax.diffeqsolve(
-            terms, ds.ImplicitMidpoint(), 0, steps * h, h, ds.to_pair(psi0), (T, share),
-            saveat=diffrax.SaveAt(steps=True, fn=saved),
-            adjoint=diffrax.ForwardMode(), max_steps=steps,
-        )  # fmt: skip
-        return jnp.mean(sol.ys[steps // 3 :])
-
-    of_each = jnp.tile(Ts, 2), jnp.repeat(jnp.array([1.0, 0.0]), 4)
-    repeated = [jnp.repeat(x, paths) for x in of_each]
-    sampled = jax.jit(jax.vmap(mean_over_time))
-    found = sampled(*repeated, jr.split(jr.key(3), 8 * paths)).reshape(8, paths)
-    means, errors = np.mean(found, axis=1), np.std(found, axis=1) / np.sqrt(paths)
-    exact = np.concatenate([exact, fine])
-    assert np.max(errors) <= 0.02
-    assert np.max(np.abs(means - exact) / errors) <= 3
+    assert jnp.max(changes) <= 1e-13
 
 
 def test_dampings_that_are_none_are_refused():
@@ -259,10 +157,8 @@ def test_dampings_that_are_none_are_refused():
     @jax.vmap
     def run(alpha):
         terms = ds.wave_terms(_anisotropy, _thermal, path, damping=alpha)
-        sol = diffrax.diffeqsolve(
-            terms, ds.ImplicitMidpoint(), 0, 0.2, 0.1, y0, 0.1, throw=False
-        )
-        return sol.result == diffrax.RESULTS.successful
+        at = terms, 0.0, 0.1, y0, 0.1, None, False
+        return ds.ImplicitMidpoint().step(*at)[-1] == diffrax.RESULTS.successful
 
     np.testing.assert_array_equal(
         run(jnp.array([0.5, -0.5, jnp.nan, jnp.inf])), [True, False, False, False]

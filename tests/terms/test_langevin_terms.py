@@ -110,72 +110,22 @@ def test_momenta_in_trees_have_frictions_and_temperatures_in_trees():
     np.testing.assert_allclose(jnp.sum(p1["a"]) + p1["b"], 5.0, rtol=1e-15)
 
 
-@pytest.mark.parametrize("n", [2, 4, 6, 10])
-def test_friction_between_particles_conserves_momentum(n):
+def test_friction_between_particles_conserves_momentum():
     # The root of a rounding error in the singular matrix is no noise.
+    n = 6
     G = n * jnp.eye(n) - jnp.ones((n, n))
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2
     y0 = jnp.arange(n) / n, jnp.zeros(n)
     for friction in (as_friction(G), lambda t, q, args: as_friction(G)):
-        path = ds.WeakBrownianPath((n,), jr.key(0))
-        terms = ds.langevin_terms(H0, friction, 1.0, path)
-        sol = diffrax.diffeqsolve(
-            terms, ds.BAOAB(), 0, 1000, 0.1, y0, max_steps=None,
-            adjoint=diffrax.ForwardMode(),
-        )  # fmt: skip
+        terms = ds.langevin_terms(H0, friction, 1.0, weak_path(n))
+        options = dict(max_steps=None, adjoint=diffrax.ForwardMode())
+        sol = diffrax.diffeqsolve(terms, ds.BAOAB(), 0, 1000, 0.1, y0, **options)
         np.testing.assert_allclose(jnp.sum(sol.ys[0]), (n - 1) / 2, atol=1e-13 * n)
         assert np.std(sol.ys[0]) > 0.1
 
 
-def test_pairs_of_particles_are_heated_and_keep_their_momentum():
-    # Friction along the line between each pair, which depends on their distance.
-    n, T = 5, 0.7
-    first, second = np.triu_indices(n, 1)
-    m = len(first)
-
-    def directions(t, q, args):
-        d = q[first] - q[second]
-        r = jnp.linalg.norm(d, axis=1, keepdims=True)
-        d = jnp.exp(-(r**2) / 2) * d / r
-        pairs = np.arange(m)
-        return (
-            jnp.zeros((n, 3, m)).at[first, :, pairs].add(d).at[second, :, pairs].add(-d)
-        )
-
-    def H0(t, p, q, args):
-        return jnp.sum(p**2) / 2 + 0.15 * jnp.sum((q[:, None] - q) ** 2)
-
-    friction = ds.FrictionAlong(directions)
-
-    @jax.jit
-    @jax.vmap
-    def run(key):
-        path = ds.WeakBrownianPath((m,), key)
-        terms = ds.langevin_terms(H0, friction, T, path)
-        # From the density of Gibbs, since the angular momentum is conserved, too.
-        start = T**0.5 * jr.normal(jr.fold_in(key, 1), (2, n, 3))
-        start = start.at[1].divide((0.6 * n) ** 0.5)
-        saveat = diffrax.SaveAt(ts=jnp.linspace(10.0, 60.0, 51))
-        sol = diffrax.diffeqsolve(
-            terms, ds.BAOAB(), 0, 60, 0.1, tuple(start), saveat=saveat,
-            max_steps=None, adjoint=diffrax.ForwardMode(),
-        )  # fmt: skip
-        p = sol.ys[0]
-        relative = p - jnp.mean(p, axis=1, keepdims=True)
-        energy = jnp.sum(relative**2, axis=(1, 2)) / 2
-        return jnp.mean(energy), jnp.sum(p[-1], axis=0) - jnp.sum(start[0], axis=0)
-
-    energies, change = run(jr.split(jr.key(0), 200))
-    np.testing.assert_allclose(change, 0, atol=1e-13)
-    # Their frequency is the root of 0.6 n: BAOAB is too cold by (omega h / 2)^2.
-    exact = T * 3 * (n - 1) / 2 * (1 - 0.6 * n * 0.1**2 / 4)
-    error = np.std(energies) / np.sqrt(len(energies))
-    assert abs(np.mean(energies) - exact) <= 3 * error
-    assert error <= 0.02 * exact
-
-
 # Lengths and ranks of the factors of semidefinite matrices.
-@pytest.mark.parametrize("n, rank", [(1, 1), (2, 1), (5, 3), (8, 8), (20, 7)])
+@pytest.mark.parametrize("n, rank", [(2, 1), (8, 8), (20, 7)])
 def test_roots_of_semidefinite_matrices_are_roots(n, rank):
     # In single precision, too, and with entries of very different size.
     X = jr.normal(jr.key(n), (n, rank)) * jnp.logspace(0, -6, n)[:, None]
@@ -208,8 +158,7 @@ def _end(terms, solver, y0, t1=0.5):
     return jnp.stack([x[-1] for x in sol.ys]), sol.result
 
 
-@pytest.mark.parametrize("solver", [ds.BAOAB(), ds.BAOAB(ds.StormerVerlet())])
-def test_traced_frictions_and_temperatures_that_are_none_fail_alone(solver):
+def test_traced_frictions_and_temperatures_that_are_none_fail_alone():
     y0, given = (jnp.ones(3), jnp.ones(3)), Given(jnp.array([0.3, 0.1, -0.2]))
 
     @jax.jit
@@ -218,7 +167,7 @@ def test_traced_frictions_and_temperatures_that_are_none_fail_alone(solver):
         if friction.ndim == 2:
             friction = as_friction(friction)
         terms = ds.langevin_terms(_pendula, friction, T, given)
-        return _end(terms, solver, y0)[1] == diffrax.RESULTS.successful
+        return _end(terms, ds.BAOAB(), y0)[1] == diffrax.RESULTS.successful
 
     skew = TENSOR.at[0, 1].set(0.5)
     one = jnp.eye(3)
@@ -243,8 +192,7 @@ def test_every_other_solver_sees_friction_and_noise():
             diffrax.diffeqsolve(terms, solver, 0.0, 0.5, 0.5 / n, y0, max_steps=n).ys
         )
         exact = np.stack(steps(diffrax.Heun(), 1024))[:, -1]
-        solvers = [diffrax.EulerHeun(), ds.ImplicitMidpoint(), ds.SRKs1()]
-        solvers += [*(kind() for kind in LANGEVIN), ds.BAOAB(ds.StormerVerlet())]
+        solvers = [ds.ImplicitMidpoint(), *(kind() for kind in LANGEVIN)]
         if not callable(friction):
             solvers += [ds.SRKs4(), diffrax.ShARK(), diffrax.Euler()]
         for solver in solvers:
@@ -264,10 +212,8 @@ def test_two_baths_have_the_mean_temperature_that_their_frictions_weigh():
         second = ds.bath_terms(H0, 1.5, 1.0, Given(W[1])).terms
         first = ds.langevin_terms(H0, 0.5, 2.0, Given(W[0])).terms
         given = diffrax.MultiTerm(*first, *second)
-        return jnp.stack(ds.BAOAB().step(
-            given, 0.0, h, (p, q), None, ds.BAOAB().init(given, 0.0, h, (p, q), None),
-            False,
-        )[0])  # fmt: skip
+        state = ds.BAOAB().init(given, 0.0, h, (p, q), None)
+        return jnp.stack(ds.BAOAB().step(given, 0.0, h, (p, q), None, state, False)[0])
 
     h, zero = 0.3, jnp.zeros(())
     A = np.stack(jax.jacobian(step, (0, 1))(zero, zero, jnp.zeros(2)), axis=1)

@@ -64,11 +64,7 @@ def _start(name, shift):
     return tuple({"x": x[:2], "y": x[2]} for x in (p, q))
 
 
-QUICK = [
-    (ds.BAOAB(), "array"),
-    (ds.BAOAB(), "matrix"),
-    (ds.BAOAB(), "along"),
-]
+QUICK = [(ds.BAOAB(), "array"), (ds.BAOAB(), "matrix")]
 # Each of the others once, with the one or the other solver in turn.
 OTHERS = zip(itertools.cycle([ds.BAOAB(), ds.ImplicitMidpoint()]), CASES)
 ALL = [*QUICK, *(case for case in OTHERS if case not in QUICK)]
@@ -93,12 +89,12 @@ def test_derivatives_are_finite_and_those_of_differences(case):
 
     points = jnp.array([[0.7, 0.0], [1.3, 0.05]])
     forward = jax.jit(jax.vmap(jax.jacfwd(end)))(points)
-    backward = jax.jit(jax.vmap(jax.grad(end)))(points)
-    values = jax.jit(jax.vmap(end))
-    units = 1e-5 * jnp.eye(2)
-    exact = (
-        jnp.stack([values(points + u) - values(points - u) for u in units], 1) / 2e-5
-    )
+    # One program for the gradients and for the values that are compared to them.
+    units = 1e-5 * jnp.concatenate([jnp.zeros((1, 2)), jnp.eye(2), -jnp.eye(2)])
+    moved = (points[:, None] + units).reshape(10, 2)
+    values, backward = jax.jit(jax.vmap(jax.value_and_grad(end)))(moved)
+    plus, minus = jnp.split(values.reshape(2, 5)[:, 1:], 2, axis=1)
+    exact, backward = (plus - minus) / 2e-5, backward[::5]
     assert np.all(np.abs(exact[:, 1]) > 1e-3)
     np.testing.assert_allclose(forward, exact, rtol=1e-6, atol=1e-9)
     np.testing.assert_allclose(backward, exact, rtol=1e-6, atol=1e-9)

@@ -12,7 +12,7 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from ..problems import Given, local_weak_orders, rigid_body_terms, weak_path
+from ..problems import Given, rigid_body_terms, weak_path
 
 
 def H0(t, s, args):
@@ -95,172 +95,66 @@ def test_spinors_of_spins_give_them_back_with_their_derivatives_everywhere(dtype
     assert np.max(sizes) <= 32 * eps
 
 
-@ft.cache
-def _thousand_systems():
-    """States, parameters, step sizes and random variables."""
-
-    def draw(key):
-        k_problem, k_h, k_W, k_A, k_coin = jr.split(key, 5)
-        s0, args = _problem(k_problem, 2, 3, float)
+def test_step_is_a_poisson_map_for_a_thousand_random_systems():
+    # A symplectic step for (p, q) is a Poisson map for s, whatever the solver, and every
+    # solver has a test that its steps are symplectic.
+    @jax.jit
+    @jax.vmap
+    def defect(key):
+        k_problem, k_h, k_W = jr.split(key, 3)
+        s0, args = _problem(k_problem, 2, 3)
         # Uniform in the logarithm over [1e-3, 0.2].
         h = jnp.exp(jr.uniform(k_h, (), float, jnp.log(1e-3), jnp.log(0.2)))
         W = jnp.sqrt(h) * jnp.clip(jr.normal(k_W, (3,)), -2.5, 2.5)
-        A = h / 2 * jr.normal(k_A, (3, 3))
-        return s0, args, h, W, A - A.T, jr.rademacher(k_coin, (3,), float)
+        at = ds.spin_terms(H0, noise, Given(W)), ds.ImplicitMidpoint(), 0.0, h
+        return ds.poisson_defect(*at, ds.to_spinors(s0), args)
 
-    return jax.jit(jax.vmap(draw))(jr.split(jr.key(0), 1000))
-
-
-# A symplectic step for (p, q) is a Poisson map for s, whatever the solver, and every solver
-# has a test that its steps are symplectic. So here is one for each kind of step.
-@pytest.mark.parametrize(
-    "solver, dtype, bound",
-    [
-        (ds.ImplicitMidpoint(), jnp.float64, 1e-13),
-        pytest.param(ds.ImplicitMidpoint(), jnp.float32, 5e-6, marks=pytest.mark.slow),
-        pytest.param(ds.NinomiyaVictoir(), jnp.float64, 1e-13, marks=pytest.mark.slow),
-    ],
-    ids=["ImplicitMidpoint", "float32", "NinomiyaVictoir"],
-)
-def test_step_is_a_poisson_map_for_a_thousand_random_systems(solver, dtype, bound):
-    def defect(s0, args, h, W, A, coin):
-        terms = ds.spin_terms(H0, noise, Given(W, A=A, two_point=coin))
-        y0 = ds.to_spinors(s0)
-        return ds.poisson_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
-
-    systems = jax.tree.map(dtype, _thousand_systems())
-    defects = jax.jit(jax.vmap(defect))(*systems)
-    assert defects.dtype == dtype
-    assert jnp.max(defects) <= bound
+    assert jnp.max(defect(jr.split(jr.key(0), 1000))) <= 1e-13
 
 
-@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), diffrax.Heun()])
-def test_poisson_defect_sees_a_method_for_the_spins_themselves(solver):
+def test_poisson_defect_sees_a_method_for_the_spins_themselves():
     # The midpoint rule keeps |s| there, but not the bracket.
     s0 = jnp.array([0.6, 0.0, 0.8])
     terms = rigid_body_terms(Given(jnp.array(0.1)))
-    defect = ds.poisson_defect(terms, solver, 0.0, 0.2, s0)
+    defect = ds.poisson_defect(terms, ds.ImplicitMidpoint(), 0.0, 0.2, s0)
     assert 1e-4 < defect < 1e-2
 
 
-def test_one_step_in_a_constant_field_is_the_rotation_of_the_cayley_map():
-    # In a field B the lift is linear with frequency |B| / 2, so that a midpoint step of
-    # it turns s about -B by four times the angle arctan(h |B| / 4).
-    B, s0, h = jnp.array([0.3, -0.5, 0.8]), jnp.array([0.2, 0.9, -0.4]), 0.5
-    field = lambda t, s, args: B @ s
-    terms = ds.spin_terms(lambda t, s, args: 0.0, field, Given(jnp.array([h])))
-    y0 = ds.to_spinors(s0)
-    y1, *_ = ds.ImplicitMidpoint().step(terms, 0.0, h, y0, None, None, False)
-    length = jnp.linalg.norm(B)
-    axis, angle = -B / length, 4 * jnp.arctan(h * length / 4)
-    expected = (
-        jnp.cos(angle) * s0
-        + jnp.sin(angle) * jnp.cross(axis, s0)
-        + (1 - jnp.cos(angle)) * (axis @ s0) * axis
-    )
-    np.testing.assert_allclose(ds.from_spinors(y1), expected, atol=1e-15)
-
-
-@pytest.mark.slow
-def test_ninomiya_victoir_is_weak_order_two_for_noises_that_do_not_commute():
-    terms = ds.spin_terms(H0, noise, weak_path(2, two_point=True))
-    s0, args = jax.vmap(lambda key: _problem(key, 1, 2))(jr.split(jr.key(2), 2))
-
-    def fn(t, y, args):
-        s = ds.from_spinors(y)[0]
-        return jnp.stack([s[2], s[0] * s[1], jnp.exp(s[1] / 2)])
-
-    hs = np.array([0.02, 0.01, 0.005, 0.0025])
-    y0 = ds.to_spinors(s0)
-    solver = ds.NinomiyaVictoir()
-    slopes = local_weak_orders(terms, solver, y0, args, hs, order=2, fn=fn)
-    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
-
-
-@pytest.mark.slow
 def test_noises_of_spins_may_be_indexed():
     s0, args = _problem(jr.key(0), 2, 3)
-    y0 = ds.to_spinors(s0)
-    path = weak_path(3, two_point=True)
     indexed = ds.IndexedNoise(lambda k, t, s, args: noise(t, s, args)[k], 3)
-    solver = ds.NinomiyaVictoir()
-
-    def end(y0, args, fields):
-        terms = ds.spin_terms(H0, fields, path)
-        y1, *_ = solver.step(terms, 0.0, 0.1, y0, args, None, False)
-        return ds.from_spinors(y1)
-
-    ends = jax.jit(lambda *x: [end(*x, fields) for fields in (noise, indexed)])(
-        y0, args
+    all_at_once, one_by_one = (
+        ds.spin_terms(H0, fields, weak_path(3))
+        .terms[1]
+        .vf(0.4, ds.to_spinors(s0), args)
+        for fields in (noise, indexed)
     )
-    np.testing.assert_allclose(*ends, atol=1e-15)
+    for x, y in zip(one_by_one, all_at_once):
+        np.testing.assert_allclose(x, y, atol=1e-15)
 
 
-def _end(y0, args, solver=ds.ImplicitMidpoint()):  # noqa: B008
-    """Of a chain of spins with a field along each axis of each spin."""
-
-    def H0(t, s, args):
-        return -jnp.sum(s[1:] * s[:-1])
-
-    dtype = y0[0].dtype
+def test_a_step_keeps_lengths_in_single_precision_and_does_not_see_the_phase():
+    dtype, eps = np.float32, np.finfo(np.float32).eps
+    H0 = lambda t, s, args: -jnp.sum(s[1:] * s[:-1])
     path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((4, 3), dtype), jr.key(0))
-    terms = ds.spin_terms(H0, lambda t, s, args: args * s, path)
-    times = jnp.array([0, 1, 0.125], dtype)
-    sol = diffrax.diffeqsolve(terms, solver, *times, y0, args, throw=False)
-    return ds.from_spinors(sol.ys)[0], sol.result == diffrax.RESULTS.successful
+    terms = ds.spin_terms(H0, lambda t, s, args: 0.3 * s, path)
 
+    @jax.jit
+    def step(y0):
+        at = terms, jnp.zeros((), dtype), jnp.ones((), dtype), y0, None, None, False
+        return ds.from_spinors(ds.ImplicitMidpoint().step(*at)[0])
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
-@pytest.mark.slow
-def test_a_batch_of_chains_keeps_lengths_and_does_not_see_the_phase(dtype):
-    eps = jnp.finfo(dtype).eps
-    s0 = jax.vmap(lambda key: _problem(key, 4, 1, dtype)[0])(jr.split(jr.key(0), 3))
-    p, q = map(np.asarray, jax.jit(ds.to_spinors)(s0))
+    s0 = _problem(jr.key(0), 4, 1, jnp.float32)[0]
+    p, q = map(np.asarray, ds.to_spinors(s0))
     # Another phase for each spin.
-    phase = 2 * np.pi * np.random.default_rng(1).random((3, 4, 1))
+    phase = 2 * np.pi * np.random.default_rng(1).random((4, 1))
     c, s = np.cos(phase).astype(dtype), np.sin(phase).astype(dtype)
-    turned = c * p + s * q, c * q - s * p
-    # The second path of the batch has no finite numbers.
-    args = jnp.array([0.3, jnp.nan, 0.5], dtype)
-    end = jax.jit(jax.vmap(_end))
-    s1, success = map(np.asarray, end((p, q), args))
-    np.testing.assert_array_equal(success, [True, False, True])
-    again = np.asarray(end(turned, args)[0])[success]
-    s1, s0 = s1[success], np.asarray(s0)[success]
+    s1, again = step((p, q)), step((c * p + s * q, c * q - s * p))
     assert s1.dtype == dtype
     assert np.max(np.linalg.norm(s1 - s0, axis=-1)) > 0.1
     lengths = [np.linalg.norm(s, axis=-1) for s in (s0, s1)]
-    np.testing.assert_allclose(*lengths, rtol=64 * eps)
-    np.testing.assert_allclose(again, s1, atol=256 * eps)
-
-
-@pytest.mark.slow
-def test_gradients_go_through_a_solve_from_the_poles():
-    s0 = np.concatenate([POLES, EQUATOR[:2]])
-    weights, direction = np.random.default_rng(1).normal(size=(2, 4, 3))
-    solver = ds.ImplicitMidpoint()
-    value = lambda s, args: jnp.sum(weights * _end(ds.to_spinors(s), args, solver)[0])
-    # One program for the gradient and for the values that are compared to it.
-    both = jax.jit(jax.value_and_grad(value, argnums=(0, 1)))
-    _, (by_s, by_args) = both(s0, 0.3)
-    k = 1e-5
-    along = lambda ds, dargs: [both(s0 + x * ds, 0.3 + x * dargs)[0] for x in (k, -k)]
-    slopes = [-np.diff(along(*d))[0] / (2 * k) for d in ((direction, 0), (0, 1))]
-    got = [np.sum(by_s * direction), by_args]
-    np.testing.assert_allclose(got, slopes, rtol=1e-8)
-
-
-@pytest.mark.parametrize(
-    "solver",
-    [ds.SRKs2(), ds.SRKs4(), ds.SRKw3(), ds.SRKw5(), ds.StormerVerlet(),
-     ds.PlateauVerlet(), ds.AdditiveGauss()],
-    ids=repr,
-)  # fmt: skip
-def test_solvers_that_need_more_structure_refuse_spins(solver):
-    s0, args = _problem(jr.key(0), 1, 1)
-    terms = ds.spin_terms(H0, noise, weak_path(1))
-    with pytest.raises(ValueError, match="use a solver for general systems"):
-        solver.init(terms, 0.0, 0.1, ds.to_spinors(s0), args)
+    np.testing.assert_allclose(*lengths, rtol=16 * eps)
+    np.testing.assert_allclose(again, s1, atol=32 * eps)
 
 
 def test_what_are_no_spins_is_refused():

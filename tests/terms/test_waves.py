@@ -16,11 +16,6 @@ from ..problems import slope, weak_path
 
 
 X = jnp.array([[0, 1], [1, 0]], complex)
-Z = jnp.array([[1, 0], [0, -1]], complex)
-
-
-def _mean(A, psi):
-    return jnp.real(jnp.conj(psi) @ A @ psi)
 
 
 def _random(key, shape=(3,), dtype=jnp.complex128):
@@ -54,8 +49,8 @@ def test_solutions_push_forward_to_the_equation_of_amplitudes():
         np.testing.assert_allclose(1j * velocity, (dx + 1j * dy) / 2, atol=1e-14)
 
 
-@pytest.mark.parametrize("dtype", [jnp.complex64, jnp.complex128])
-def test_amplitudes_of_pairs_give_them_back(dtype):
+def test_amplitudes_of_pairs_give_them_back():
+    dtype = jnp.complex64
     psi = {
         "a": _random(jr.key(0), (2, 3), dtype),
         "b": (_random(jr.key(1), (), dtype),),
@@ -71,12 +66,11 @@ def test_amplitudes_of_pairs_give_them_back(dtype):
     jax.tree.map(lambda e, x: same(e, jnp.sum(jnp.abs(x) ** 2)), energy, psi)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_real_amplitudes_have_no_momentum(dtype):
-    p, q = ds.to_pair(jnp.array([0.6, -0.8], dtype))
-    assert p.dtype == q.dtype == dtype
+def test_real_amplitudes_have_no_momentum():
+    p, q = ds.to_pair(jnp.array([0.6, -0.8], jnp.float32))
+    assert p.dtype == q.dtype == jnp.float32
     np.testing.assert_array_equal(p, 0)
-    np.testing.assert_allclose(q, np.sqrt(2) * np.array([0.6, -0.8], dtype))
+    np.testing.assert_allclose(q, np.sqrt(2) * np.array([0.6, -0.8]), rtol=1e-6)
 
 
 def test_what_are_no_pairs_of_real_arrays_is_refused():
@@ -86,55 +80,14 @@ def test_what_are_no_pairs_of_real_arrays_is_refused():
             ds.from_pair(wrong)  # pyright: ignore
 
 
-@pytest.mark.parametrize(
-    "solver",
-    [ds.ImplicitMidpoint(), ds.SRKw1(), ds.StrangGauss(), ds.NinomiyaVictoir()],
-    ids=repr,
-)
 @pytest.mark.slow
-def test_norm_is_kept_over_ten_thousand_steps(solver):
-    H0 = lambda t, psi, args: _mean(X, psi) + jnp.sum(jnp.abs(psi) ** 4)
-    noise = lambda t, psi, args: 0.5 * _mean(Z, psi) + 0.2 * jnp.abs(psi[0]) ** 4
-    terms = ds.wave_terms(H0, noise, ds.WeakBrownianPath((), jr.key(0)))
-    psi0 = jnp.array([0.6, 0.8j])
-    norm = lambda t, y, args: jnp.sum(jnp.abs(ds.from_pair(y)) ** 2)
-    sol = diffrax.diffeqsolve(
-        terms, solver, 0, 1000, 0.1, ds.to_pair(psi0), max_steps=None,
-        adjoint=diffrax.ForwardMode(),
-        saveat=diffrax.SaveAt(ts=jnp.arange(0, 1000, 10.0), fn=norm),
-    )  # fmt: skip
-    # The norm is interpolated between the ends of steps, where it is the same.
-    assert sol.stats["num_steps"] >= 10_000
-    # One rounding error a step, all of one sign.
-    bound = sol.stats["num_steps"] * jnp.finfo(sol.ys.dtype).eps
-    assert jnp.max(jnp.abs(sol.ys - 1)) <= bound
-
-
-@pytest.mark.parametrize(
-    "solver, order",
-    [(ds.SRKw1(), 1), (ds.StrangGauss(), 2)],
-    ids=["SRKw1", "StrangGauss"],
-)
-def test_noisy_qubit_has_the_density_matrix_of_lindblad_without_sampling(solver, order):
+def test_noisy_qubit_has_the_density_matrix_of_lindblad_without_sampling():
     steps = np.array([16, 32, 64])
-    found = jnp.stack([qubit.density(solver, 2.0, int(n)) for n in steps])
+    found = jnp.stack([qubit.density(ds.StrangGauss(), 2.0, int(n)) for n in steps])
     np.testing.assert_allclose(jnp.trace(found, axis1=1, axis2=2), 1.0, rtol=1e-12)
     errors = jnp.max(jnp.abs(found - qubit.lindblad(2.0)), axis=(1, 2))
-    assert abs(slope(1 / steps, errors) - order) <= 0.1
-    assert errors[-1] <= (1e-2 if order == 1 else 1e-4)
-
-
-@pytest.mark.slow
-def test_noisy_qubit_sampled():
-    times = np.array([1.0, 2.0])
-    path = lambda key: qubit.sampled(key, times, 0.1)
-    values = jax.jit(jax.vmap(path))(jr.split(jr.key(0), 4000))
-    rho = jnp.stack([qubit.lindblad(t) for t in times])
-    exact = [jnp.trace(rho @ M, axis1=1, axis2=2).real for M in (qubit.X, qubit.Z)]
-    error = jnp.mean(values, axis=0) - jnp.stack(exact, axis=-1)
-    standard_error = jnp.std(values, axis=0) / np.sqrt(len(values))
-    assert jnp.max(standard_error) <= 0.01
-    assert jnp.max(jnp.abs(error) / standard_error) <= 3
+    assert abs(slope(1 / steps, errors) - 2) <= 0.1
+    assert errors[-1] <= 1e-4
 
 
 PSI0 = qubit.PSI0
@@ -148,9 +101,8 @@ def test_gradients_with_respect_to_complex_parameters_are_those_of_jax():
     @jax.jit
     @ft.partial(jax.value_and_grad, argnums=(0, 1))
     def both(z, psi0):
-        solver = ds.ImplicitMidpoint()
-        sol = diffrax.diffeqsolve(terms, solver, 0, 1, 0.25, ds.to_pair(psi0), z)
-        return jnp.abs(ds.from_pair(sol.ys)[-1, 0]) ** 2
+        at = terms, 0.0, 0.5, ds.to_pair(psi0), z, None, False
+        return jnp.abs(ds.from_pair(ds.ImplicitMidpoint().step(*at)[0])[0]) ** 2
 
     z, k = 0.7 - 0.2j, 1e-6
     gradient, by_start = both(z, PSI0)[1]
@@ -164,17 +116,14 @@ def test_gradients_with_respect_to_complex_parameters_are_those_of_jax():
 
 
 def test_noises_of_waves_may_be_indexed():
-    path = weak_path(2, two_point=True)
-    y0 = ds.to_pair(_random(jr.key(0)))
+    y = ds.to_pair(_random(jr.key(0)))
     indexed = ds.IndexedNoise(lambda k, t, psi, args: _site_noise(t, psi, args)[k], 2)
-    solver = ds.NinomiyaVictoir()
-
-    def end(y0, fields):
-        terms = ds.wave_terms(_lattice, fields, path)
-        return ds.from_pair(solver.step(terms, 0.0, 0.1, y0, 1.1, None, False)[0])
-
-    ends = jax.jit(lambda y0: [end(y0, fields) for fields in (_site_noise, indexed)])
-    np.testing.assert_allclose(*ends(y0), atol=1e-15)
+    all_at_once, one_by_one = (
+        ds.wave_terms(_lattice, fields, weak_path(2)).terms[1].vf(0.4, y, 1.1)
+        for fields in (_site_noise, indexed)
+    )
+    for a, b in zip(one_by_one, all_at_once):
+        np.testing.assert_allclose(a, b, atol=1e-15)
 
 
 def test_complex_states_are_told_of_wave_terms():
