@@ -12,6 +12,7 @@ from scipy import special
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import random as words
 from diffrax_symplectic._brownian.random import normal_from_words
+from diffrax_symplectic._solver import common_path, path_of_array_cell
 
 
 AREA = diffrax.SpaceTimeLevyArea
@@ -42,26 +43,6 @@ def test_each_word_has_its_quantile(dtype, rtol):
     near = np.unique((words[:, None] + np.arange(3, dtype=np.uint32)).ravel())
     steps = np.diff(np.asarray(normal_from_words(jnp.asarray(near), jnp.float64)))
     assert np.all(steps > 0)
-
-
-def test_moments_to_the_eighth_are_those_of_the_normal_distribution():
-    # The mean over all 2^32 words: by the rule of Gauss and Legendre in each octave of
-    # words, whose spacing is far below the length of all but the first, which are summed.
-    rare = np.arange(2**12, dtype=np.uint32)
-    x, weights = np.polynomial.legendre.leggauss(32)
-    starts = 2.0 ** np.arange(12, 31)
-    # Midpoints of words: the integral over [a - 1/2, 2 a - 1/2) is their sum.
-    nodes = starts[:, None] * (1.5 + x / 2) - 0.5
-    near = np.round(nodes).astype(np.uint32)
-    value = np.asarray(normal_from_words(jnp.asarray(near), jnp.float64))
-    # From the nearest word to the node, along the density's slope.
-    density = np.exp(-(value**2) / 2) / np.sqrt(2 * np.pi)
-    value = value + (nodes - near) / 2**32 / density
-    tail = np.asarray(normal_from_words(jnp.asarray(rare), jnp.float64))
-    for k, exact, rtol in ((2, 1, 1e-7), (4, 3, 1e-6), (6, 15, 2e-6), (8, 105, 1e-5)):
-        octaves = np.sum(value**k * weights * starts[:, None] / 2)
-        mean = 2 * (octaves + np.sum(tail**k)) / 2**32
-        np.testing.assert_allclose(mean, exact, rtol=rtol)
 
 
 def test_sampled_steps_and_noises_are_independent_with_the_right_variance():
@@ -188,3 +169,23 @@ def test_steps_shorter_than_the_tolerance_of_a_tree_are_an_error():
     for h, tol in ((0.09, 0.1), (0.1, 0.5)):
         with pytest.raises(Exception, match="Pass a smaller `tol`"):
             jax.block_until_ready(solve(jnp.array(h), tol))
+
+
+SOLVERS = [
+    ds.StormerVerlet(),
+    ds.PlateauVerlet(),
+    ds.LevyAreaMidpoint(),
+    diffrax.Heun(),
+]
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=lambda x: type(x).__name__)
+def test_a_cell_that_is_an_array_gives_the_same_motion(solver):
+    cell, key = 0.125, jr.key(4)
+    plain = common_path(solver, cell, (3,), key)
+    traced = path_of_array_cell(solver, np.asarray(cell), (3,), key)
+    over = jnp.asarray(0.5), jnp.asarray(0.5 + 4 * cell)
+    got = traced.evaluate(*over, use_levy=True)
+    exact = plain.evaluate(*over, use_levy=True)
+    for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(exact), strict=True):
+        np.testing.assert_array_equal(x, y)

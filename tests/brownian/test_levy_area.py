@@ -75,22 +75,6 @@ def test_bridge_areas_have_their_moments_given_the_integral():
         assert abs(np.mean(sample) - exact) <= 4 * np.std(sample) / np.sqrt(n)
 
 
-def test_kurtosis_without_terms_is_short_of_the_law_and_terms_mend_it():
-    # Exact: the bridge's area given H is Gaussian without terms. Its fourth moment
-    # falls short of the law's by the kurtosis of a sum of products of Gaussians.
-    pairs = np.array([0, 0, 1]), np.array([1, 2, 2])
-
-    def fourth_moment(W, H, A):
-        i, j = pairs
-        return np.mean((A[:, i, j] - H[:, i] * W[:, j] + H[:, j] * W[:, i]) ** 4)
-
-    short, mended = (fourth_moment(*_areas(terms)) for terms in (0, 8))
-    # The bridge's own area has cumulants sum_r 2 E(r-th term): variance 1 / 12 and fourth
-    # moment 3 / 144 + 12 sum_r (1 / (2 pi r))^4 = 3 / 144 + 1 / 120.
-    assert abs(mended - (3 / 144 + 1 / 120)) <= 0.02 * mended
-    assert short < mended
-
-
 def test_areas_over_cells_follow_chens_rule():
     sample = FineSample.draw(jr.key(0), 32, 3)
     path = ds.LevyAreaBrownianPath(sample, jr.key(1), num_terms=2, cell=1 / 16)

@@ -2,7 +2,6 @@
 
 import diffrax
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -236,17 +235,11 @@ def test_atoms_on_a_line_stay_there_and_turn_as_one():
     terms = ds.hamiltonian_terms(_free, constraint=straight)
     # Both ends are 1 from the middle, and have the speed 1.
     p = jnp.array([[0.8, -0.6], [0.0, 0.0], [-0.8, 0.6]])
-    ends = []
-    for h in (0.02, 0.01):
-        number = round(1.5 / h)
-        (_, q), okay = take_steps(number, terms, h, (p, LINE[1]))
-        assert bool(okay)
-        np.testing.assert_allclose(q[1], (q[0] + q[2]) / 2, atol=1e-14)
-        ends.append(q[2])
+    (_, q), okay = take_steps(150, terms, 0.01, (p, LINE[1]))
+    assert bool(okay)
+    np.testing.assert_allclose(q[1], (q[0] + q[2]) / 2, atol=1e-14)
     exact = np.cos(1.5) * LINE[1][2] + np.sin(1.5) * p[2]
-    coarse, fine = (np.linalg.norm(end - exact) for end in ends)
-    # The step is of second order.
-    assert fine < 1e-4 and 3.9 < coarse / fine < 4.1
+    assert np.linalg.norm(q[2] - exact) < 1e-4
 
 
 def test_a_state_is_projected_in_the_metric_of_the_masses():
@@ -313,18 +306,17 @@ def test_what_makes_no_sense_with_constraints_refuses_them():
     terms = chain(ds.WeakBrownianPath((2,), jr.key(0)))
     y0 = chain_state(jr.key(5))
     at = terms, ds.StormerVerlet(), 0.0, 0.1, y0, 0.5
-    with pytest.raises(
-        ValueError, match="`second_moment_map` takes no constrained terms"
+    fn = lambda t, y, args: y[0]
+    for name, call in (
+        ("second_moment_map", lambda: ds.second_moment_map(*at)),
+        ("weak_order_defect", lambda: ds.weak_order_defect(*at, fn=fn, order=1)),
+        (
+            "ReversingAdjoint",
+            lambda: solved(terms, 1.0, 0.1, y0, 0.5, adjoint=ds.ReversingAdjoint()),
+        ),
     ):
-        ds.second_moment_map(*at)
-    with pytest.raises(
-        ValueError, match="`weak_order_defect` takes no constrained terms"
-    ):
-        ds.weak_order_defect(*at, fn=lambda t, y, args: y[0], order=1)
-    with pytest.raises(
-        ValueError, match="`ReversingAdjoint` takes no constrained terms"
-    ):
-        solved(terms, 1.0, 0.1, y0, 0.5, adjoint=ds.ReversingAdjoint())
+        with pytest.raises(ValueError, match=f"`{name}` takes no constrained terms"):
+            call()
     two = diffrax.MultiTerm(*terms.terms, *PENDULUM.terms)
     with pytest.raises(ValueError, match="Only one of the terms"):
         solved(two, 1.0, 0.1, y0, 0.5)
@@ -443,35 +435,6 @@ def test_a_flow_in_a_plane_has_an_error_of_second_order_in_the_law_of_gibbs():
     assert max(_errors_of_gibbs(solver, 0.5, slow=True)) < 1e-13
 
 
-@pytest.mark.slow
-def test_steps_with_one_rate_of_friction_are_conformally_symplectic():
-    rate, h = 0.8, 0.1
-
-    def terms(W):
-        friction = rate * jnp.broadcast_to(MASSES, (3, 2))
-        at = chain_energy, friction, TEMPERATURE, Given(W)
-        return ds.langevin_terms(*at, constraint=rods)
-
-    @jax.jit
-    @jax.vmap
-    def two_forms(key):
-        (p, q), W = chain_state(key), 0.3 * jr.normal(key, (3, 2))
-        flat, unravel = jfu.ravel_pytree((p, q))
-        step = lambda x: take_step(terms(W), 0.0, h, unravel(x), 0.5, ds.BAOAB())[0]
-        jacobian = jax.jacfwd(lambda x: jfu.ravel_pytree(step(x))[0])(flat)
-        hidden = lambda y: jax.jvp(lambda q: rods(q, None), (y[1],), (y[0] / MASSES,))
-        normals = jax.jacfwd(lambda x: jnp.concatenate(hidden(unravel(x))))(flat)
-        Z = jnp.linalg.svd(normals)[2][6:].T
-        zero, one = jnp.zeros((6, 6)), jnp.eye(6)
-        omega = jnp.block([[zero, one], [-one, zero]])
-        moved = jacobian @ Z
-        return moved.T @ omega @ moved, Z.T @ omega @ Z
-
-    after, before = two_forms(jr.split(jr.key(6), 20))
-    c = (1 - rate * h / 2) / (1 + rate * h / 2)
-    np.testing.assert_allclose(after, c * before, atol=1e-14)
-
-
 FIELD = 1.2
 
 
@@ -507,42 +470,36 @@ def test_rigid_dimers_in_a_field_have_the_means_of_gibbs():
     assert np.max(np.abs(np.sum((q[:, 0] - q[:, 1]) ** 2, axis=1) - 1)) <= 1e-14
 
 
-@needs_drjit
-@pytest.mark.slow
-def test_the_fused_engine_solves_for_more_multipliers_than_are_written_out():
-    number = 7
-    line = jnp.stack([jnp.arange(number) % 2, jnp.arange(number) // 2], axis=1) * 1.0
+PATH = ds.WeakBrownianPath((2, 3), jr.key(0))
+KICKED = ds.hamiltonian_terms(
+    dimer_energy, lambda t, p, q, args: jnp.sin(q), PATH, constraint=dimer_rod
+)
+
+
+def zigzag():
+    """Seven bonds, for more multipliers than are written out."""
+    places = jnp.arange(7)
+    q = jnp.stack([places % 2, places // 2], axis=1) * 1.0
     bonds = lambda q, args: jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1)
-    lengths = bonds(line, None)
-    free = lambda t, p, q, args: jnp.sum(p**2) / 2
     terms = ds.langevin_terms(
-        free,
-        1.0,
-        TEMPERATURE,
-        ds.WeakBrownianPath((number, 2), jr.key(0)),
-        constraint=lambda q, args: bonds(q, args) - lengths,
-    )
-    at = terms, ds.BAOAB(), 0, 0.4, 0.1, (0 * line, line)
-    fused, plain = (
-        ds.ensemble(*at, key=jr.key(2), num_paths=20, engine=engine)
-        for engine in ("drjit", "jax")
-    )
-    assert fused.num_stragglers == 0
-    for a, b in zip(fused.ys, plain.ys):
-        np.testing.assert_allclose(a, b, atol=1e-12)
+        _free, 1.0, TEMPERATURE, ds.WeakBrownianPath((7, 2), jr.key(0)),
+        constraint=lambda x, args: bonds(x, args) - bonds(q, args),
+    )  # fmt: skip
+    return terms, ds.BAOAB(), (0 * q, q)
 
 
 @needs_drjit
 @pytest.mark.parametrize(
-    "solver", slow_except(FLOWS[1:2], [ds.StormerVerlet(), *FLOWS[:2]]), ids=repr
+    "terms, solver, y0",
+    [
+        (dimer(PATH), FLOWS[1], DIMER),
+        pytest.param(KICKED, ds.StormerVerlet(), DIMER, marks=pytest.mark.slow),
+        pytest.param(*zigzag(), marks=pytest.mark.slow),
+    ],
+    ids=["bath", "kicks", "bonds"],
 )
-def test_the_fused_engine_takes_the_same_steps(solver):
-    path = ds.WeakBrownianPath((2, 3), jr.key(0))
-    terms = dimer(path)
-    if isinstance(solver, ds.StormerVerlet):
-        kicks = lambda t, p, q, args: jnp.sin(q)
-        terms = ds.hamiltonian_terms(dimer_energy, kicks, path, constraint=dimer_rod)
-    at = terms, solver, 0, 2, 0.1, DIMER
+def test_the_fused_engine_takes_the_same_steps(terms, solver, y0):
+    at = terms, solver, 0, 0.4, 0.1, y0
     fused, plain = (
         ds.ensemble(*at, key=jr.key(2), num_paths=50, engine=engine)
         for engine in ("drjit", "jax")
@@ -550,14 +507,6 @@ def test_the_fused_engine_takes_the_same_steps(solver):
     assert fused.num_stragglers == 0
     for a, b in zip(fused.ys, plain.ys):
         np.testing.assert_allclose(a, b, atol=1e-12)
-
-
-def test_expectations_refuse_starts_off_the_constraint():
-    terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
-    off = DIMER[0], 1.001 * DIMER[1]
-    phi = lambda t, y, args: y[1]
-    with pytest.raises(ValueError, match="constrained_state"):
-        ds.expectation(phi, terms, ds.BAOAB(), 0, 1, 0.1, off, key=jr.key(1))
 
 
 def test_langevin_dynamics_refuse_constraints_with_other_solvers():
@@ -571,19 +520,10 @@ def test_langevin_dynamics_refuse_constraints_with_other_solvers():
     ):
         with pytest.raises(ValueError, match=message):
             solver.init(terms, 0.0, 0.1, DIMER, None)
-
-
-@pytest.mark.slow
-def test_a_derivative_by_the_friction_along_a_path():
-    path = ds.FixedStepBrownianPath((2, 3), jr.key(0))
-
-    def end(friction):
-        at = 3, dimer(path, friction), 0.1, DIMER, None, ds.BAOAB()
-        return jnp.sum(take_steps(*at)[0][0] ** 3)
-
-    end = jax.jit(end)
-    exact = (end(1.0 + 1e-5) - end(1.0 - 1e-5)) / 2e-5
-    np.testing.assert_allclose(jax.jit(jax.grad(end))(1.0), exact, rtol=1e-8)
+    off = DIMER[0], 1.001 * DIMER[1]
+    phi = lambda t, y, args: y[1]
+    with pytest.raises(ValueError, match="constrained_state"):
+        ds.expectation(phi, terms, ds.BAOAB(), 0, 1, 0.1, off, key=jr.key(1))
 
 
 def circle(centre, radius):

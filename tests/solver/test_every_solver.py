@@ -545,13 +545,13 @@ def test_systems_of_another_structure_are_refused(solver):
 
 
 def test_bad_shapes_keys_and_wants_are_refused():
-    path = ds.ImplicitMidpoint().path
-    with pytest.raises(ValueError, match="`want` must be"):
-        path((2,), jr.key(0), want="moments")  # pyright: ignore
-    with pytest.raises(ValueError, match="key"):
-        path((2,), 3)  # pyright: ignore
-    with pytest.raises(ValueError, match="`shape`"):
-        path(3, jr.key(0))  # pyright: ignore
+    for shape, key, want, says in (
+        ((2,), jr.key(0), "moments", "`want` must be"),
+        ((2,), 3, "weak", "key"),
+        (3, jr.key(0), "weak", "`shape`"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            ds.ImplicitMidpoint().path(shape, key, want=want)
 
 
 def test_solvers_say_what_they_need():

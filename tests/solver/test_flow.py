@@ -176,29 +176,6 @@ def test_a_fused_kernel_takes_the_same_paths(name):
         np.testing.assert_allclose(x, y, rtol=1e-11, atol=1e-12)
 
 
-@quick()
-def test_gradients_are_those_of_differences_and_of_the_way_back(name):
-    path = ds.FixedStepBrownianPath((N,), KEY)
-
-    def end(parameters, adjoint):
-        friction, temperature = parameters
-        terms = _chain(friction=friction, temperature=temperature, path=path)
-        sol = diffrax.diffeqsolve(terms, FLOWS[name], 0, 1, 0.1, START, adjoint=adjoint)
-        return jnp.sum(sol.ys[1][-1] ** 2)
-
-    at = jnp.array([GAMMA, T])
-    checkpoints = diffrax.RecursiveCheckpointAdjoint()
-    got = jax.jit(jax.grad(lambda x: end(x, checkpoints)))(at)
-    reversing = jax.jit(jax.grad(lambda x: end(x, ds.ReversingAdjoint())))(at)
-    np.testing.assert_allclose(reversing, got, rtol=1e-7)
-    value = jax.jit(lambda x: end(x, checkpoints))
-    for k in range(2):
-        e = 1e-5 * jnp.eye(2)[k]
-        np.testing.assert_allclose(
-            (value(at + e) - value(at - e)) / 2e-5, got[k], rtol=1e-5
-        )
-
-
 def test_single_precision_stays_single():
     y0 = tuple(x.astype(jnp.float32) for x in START)
     struct = jax.ShapeDtypeStruct((N,), jnp.float32)
@@ -307,20 +284,6 @@ def test_a_suggestion_for_masses_that_depend_on_positions():
         solver = found[0].solver
         path = found[0].terms(KEY)
         assert np.all(np.isfinite(_one_step(solver, path, 0.1, y0)[1]))
-
-
-def test_momenta_of_langevin_middle_are_wrong_under_a_current():
-    # A constant force 1 on a free particle with friction 1: <p> = 1, without sampling.
-    terms = ds.langevin_terms(
-        lambda t, p, q, args: p**2 / 2 - q, 1.0, 0.4, ds.WeakBrownianPath((), KEY)
-    )
-    y0 = jnp.zeros(()), jnp.zeros(())
-    h = 0.2
-    for solver, mean in ((ds.BAOAB(), 1.0), (ds.LangevinMiddle(), 1 - h / 2)):
-        K = np.asarray(ds.second_moment_map(terms, solver, 0.0, h, y0))
-        z = np.kron([1.0, 0, 0], [1.0, 0, 0])
-        end = np.linalg.matrix_power(K, 400) @ z
-        np.testing.assert_allclose(end[1], mean, rtol=1e-9)
 
 
 def test_a_flow_that_returns_nan_is_named():

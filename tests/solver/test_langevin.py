@@ -4,6 +4,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
+import lineax as lx
 import numpy as np
 import pytest
 
@@ -14,7 +15,7 @@ from examples.hard_cases._ensemble import gaussian
 from examples.hard_cases._stationary import stationary_bias, Step
 
 from ..families import slow_except
-from ..problems import as_friction, damped_terms, local_weak_orders, weak_path
+from ..problems import as_friction, damped_terms, Given, local_weak_orders, weak_path
 
 
 MASS, T, STIFFNESS = 2.0, 0.5, 1.6
@@ -224,3 +225,115 @@ def test_terms_of_diffrax_are_taken_as_they_are(solver):
     np.testing.assert_array_equal(successful(jnp.array([0.5, -0.5])), [True, False])
     found = ds.suggest_solver(_diffrax_terms(path), 0.0, (x, v), 0.3, want="weak")
     assert isinstance(found[0].solver, ds.BAOAB)
+
+
+def _two_pendula(t, p, q, args):
+    """With coupling, and masses 1 and 2."""
+    forces = jnp.cos(q[0] - 2 * q[-1] + t) - jnp.sum(jnp.sin(q))
+    return jnp.sum(p**2 / jnp.arange(1, len(p) + 1)) / 2 + forces
+
+
+MATRIX = jnp.array([[1.0, 0.4], [0.4, 0.7]])
+
+
+each_flow = pytest.mark.parametrize(
+    "solver",
+    [ds.BAOAB(), pytest.param(ds.BAOAB(ds.StormerVerlet()), marks=pytest.mark.slow)],
+    ids=repr,
+)
+
+
+@each_flow
+def test_local_weak_order_is_two_where_friction_depends_on_positions_and_time(solver):
+    # The friction does not commute with the covariance of the noise.
+    friction = lambda t, q, args: as_friction(MATRIX * jnp.cos(t + q[0] - q[1]))
+    noise = lambda t, p, q, args: jnp.stack([q[0], jnp.sin(q[1] + q[0] * t)])
+    terms = damped_terms(_two_pendula, friction, noise, weak_path(2))
+    y0 = jnp.array([0.3, -0.4]), jnp.array([0.5, 0.1])
+    hs = jnp.array([0.004, 0.002, 0.001])
+    batch = jax.tree.map(lambda x: x[None], y0)
+    slopes = local_weak_orders(terms, solver, batch, None, hs, order=2)
+    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
+
+
+def test_after_a_jump_the_forces_are_new():
+    terms = ds.langevin_terms(_two_pendula, 0.5, 0.8, Given(jnp.array([0.3, 0.1])))
+    solver, y0 = ds.BAOAB(), (jnp.ones(2), jnp.zeros(2))
+    state = solver.init(terms, 0.0, 0.1, (y0[0], y0[1] + 1), None)
+    step = lambda state, jump: solver.step(terms, 0.0, 0.1, y0, None, state, jump)[0]
+    fresh = step(solver.init(terms, 0.0, 0.1, y0, None), False)
+    np.testing.assert_array_equal(jax.jit(step)(state, True), fresh)
+    assert np.max(np.abs(np.subtract(step(state, False), fresh))) > 1e-3
+
+
+def test_backward_in_time_a_step_is_undone():
+    terms = ds.langevin_terms(
+        _two_pendula, as_friction(MATRIX), 0.8, Given(jnp.array([0.3, 0.1]))
+    )
+    y0 = jnp.ones(2), jnp.array([0.2, 0.4])
+    solve = lambda t0, t1, y: [
+        x[-1]
+        for x in diffrax.diffeqsolve(
+            terms, ds.BAOAB(), t0, t1, (t1 - t0) / 8, y, max_steps=8
+        ).ys
+    ]
+    there = solve(0.0, 1.0, y0)
+    np.testing.assert_allclose(solve(1.0, 0.0, tuple(there)), y0, atol=1e-13)
+
+
+def test_between_steps_a_solution_is_interpolated_between_their_ends():
+    push = lambda t, p, q, args: jnp.stack([jnp.sum(q)])
+    terms = damped_terms(_two_pendula, 1.0, push, Given(jnp.array([0.3])))
+    solver, y0 = ds.BAOAB(), (jnp.ones(2), jnp.ones(2))
+    state = solver.init(terms, 0.0, 0.1, y0, None)
+    y1, _, dense, *_ = solver.step(terms, 0.0, 0.1, y0, None, state, False)
+    np.testing.assert_array_equal(dense["y0"], y0)
+    np.testing.assert_array_equal(dense["y1"], y1)
+
+
+def test_what_baoab_cannot_solve_is_refused():
+    y0, path = (jnp.ones(2), jnp.ones(2)), weak_path(2)
+    force = lambda t, p, q, args: -q
+    mixed = lambda t, p, q, args: jnp.sum(p * q)
+    mass = lambda t, p, q, args: p @ jnp.linalg.solve(jnp.diag(1 + q**2), p) / 2
+    fast = lambda t, p, q, args: jnp.sum(jnp.sqrt(1 + p**2))
+    of_momenta = lambda t, p, q, args: jnp.sin(p)
+    number = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    control = diffrax.LinearInterpolation(jnp.array([0.0, 1.0]), jnp.array([0.0, 2.0]))
+
+    def turn(t, y, args):
+        return lx.FunctionLinearOperator(lambda w: (-y[1] * w, y[0] * w), number)
+
+    bath = ds.bath_terms(_two_pendula, 0.5, 1.0, path).terms
+    driven = diffrax.MultiTerm(diffrax.ControlTerm(turn, control), *bath)
+    # A state (x, v), of which the first half is no momentum.
+    swapped = diffrax.ODETerm(lambda t, y, args: (y[1], -y[0]))
+    fine = damped_terms(_two_pendula, 1.0, force, path)
+    integers = jax.tree.map(lambda x: x.astype(int), y0)
+    other = r"needs H0 = V.*`BAOAB\(ImplicitMidpoint\(\)\)`"
+    for terms, start, match in (
+        (damped_terms(mixed, 1.0, force, path), y0, other),
+        (damped_terms(mass, 1.0, force, path), y0, other),
+        (damped_terms(_two_pendula, 1.0, of_momenta, path), y0, "needs H0 = V"),
+        (
+            damped_terms(fast, 1.0, force, path),
+            y0,
+            "linear in p.*`ImplicitMidpoint` or `StrangGauss`",
+        ),
+        (fine, integers, "needs a state `y0` of real"),
+        (fine, jax.tree.map(lambda x: 1j * x, y0), "needs a state `y0` of real"),
+        (driven, y0, "needs a drift driven by time"),
+        (
+            ds.hamiltonian_terms(_two_pendula, force, path),
+            y0,
+            "these have none.*`langev",
+        ),
+        (swapped, y0, "these have none.*`langevin_terms"),
+    ):
+        with pytest.raises(ValueError, match=f"`BAOAB` .*{match}"):
+            ds.BAOAB().init(terms, 0.0, 0.1, start, None)
+    spins = ds.spin_terms(lambda t, s, args: s[2])
+    terms = diffrax.MultiTerm(*spins.terms, *ds.bath_terms(_two_pendula, 0.3).terms)
+    y0 = ds.to_spinors(jnp.array([0.6, 0.0, 0.8]))
+    with pytest.raises(ValueError, match="friction to a canonical.*Pass `damping=`"):
+        ds.BAOAB(ds.ImplicitMidpoint()).init(terms, 0.0, 0.1, y0, None)

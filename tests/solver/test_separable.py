@@ -101,3 +101,27 @@ def test_unused_halves_of_gradients_are_not_computed():
     for solver, kicks in ((ds.StormerVerlet(), 1), (ds.SRKw3("b"), 1), (ds.SRKw3(), 3)):
         assert count(step(solver), "cosine") == kicks
     assert count(step(ds.SRKs3()), "cosine") < count(step(ds.SRKs2()), "cosine")
+
+
+def test_stormer_verlet_drifts_half_a_step_kicks_and_drifts_again():
+    y0, args = _problem(jr.key(0), 2, 2)
+    t0, h, W = 0.3, 0.1, jnp.array([0.4, -0.3])
+    terms = ds.hamiltonian_terms(H0, noise, Given(W))
+    drift, diffusion = terms.terms
+    p, q = y0
+    q = q + h / 2 * drift.vf(t0, (p, q), args)[1]
+    kick = h * drift.vf(t0 + h / 2, (p, q), args)[0]
+    p = p + kick + diffusion.vf_prod(t0 + h / 2, (p, q), args, W)[0]
+    q = q + h / 2 * drift.vf(t0, (p, q), args)[1]
+    y1, *_ = ds.StormerVerlet().step(terms, t0, t0 + h, y0, args, None, False)
+    np.testing.assert_allclose(y1, (p, q), rtol=1e-15)
+
+
+def test_explicit_methods_have_no_equation_to_solve():
+    y0, args = _problem(jr.key(0), 2, 2)
+    terms = ds.hamiltonian_terms(H0, noise, ds.PlateauVerlet().path((2,), jr.key(0)))
+    for solver in (ds.PlateauVerlet(), ds.StormerVerlet()):
+        assert not isinstance(solver, diffrax.AbstractImplicitSolver)
+        step = lambda y0, s=solver: s.step(terms, 0.0, 0.1, y0, args, None, False)[0]
+        text = str(jax.make_jaxpr(step)(y0))
+        assert "root_find" not in text and "triangular_solve" not in text

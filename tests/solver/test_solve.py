@@ -1,4 +1,4 @@
-"""Whole solves: strong order, invariants, gradients, failures, bad input."""
+"""Whole solves: invariants, root finders, failures, single precision."""
 
 import dataclasses
 import functools as ft
@@ -40,32 +40,6 @@ def test_rigid_body_stays_on_the_sphere_over_1e5_steps(solver):
         saveat=diffrax.SaveAt(ts=jnp.linspace(0, h * steps, 101)),
     )  # fmt: skip
     assert np.max(np.abs(np.sum(np.square(sol.ys), axis=1) - 1)) <= 1e-11
-
-
-@pytest.mark.slow
-def test_adjoints_agree():
-    y0, args = random_problem(jr.key(0), 1, 2)
-    terms = ds.hamiltonian_terms(H0, noise, weak_path(2))
-
-    def solve(y0, adjoint):
-        at = terms, ds.ImplicitMidpoint(), 0.0, 0.5, 0.1, y0, args
-        return jnp.sum(diffrax.diffeqsolve(*at, adjoint=adjoint, max_steps=8).ys[0])
-
-    @jax.jit
-    def derivatives(y0):
-        tangent = jax.tree.map(jnp.ones_like, y0)
-        forward = lambda y0: solve(y0, diffrax.ForwardMode())
-        backward = [
-            jnp.sum(jnp.stack(jax.grad(solve)(y0, adjoint)))
-            for adjoint in (
-                diffrax.DirectAdjoint(),
-                diffrax.RecursiveCheckpointAdjoint(),
-            )
-        ]
-        return jax.jvp(forward, (y0,), (tangent,))[1], backward
-
-    expected, got = derivatives(y0)
-    np.testing.assert_allclose(got, expected, rtol=1e-10)
 
 
 OTHER_FINDERS = [
@@ -151,7 +125,7 @@ def test_failed_paths_do_not_spoil_their_neighbours():
     for i in (0, 2):
         alone = solve(q[i], keys[i])
         for a, b in zip(batch.ys, alone.ys):
-            np.testing.assert_allclose(a[i], b, rtol=1e-15)
+            np.testing.assert_allclose(a[i], b, rtol=4 * np.finfo(float).eps)
     # Nothing that is not a number goes unannounced.
     finite = jnp.isfinite(batch.ys[0][:, 0]) & jnp.isfinite(batch.ys[1][:, 0])
     assert jnp.all(finite | ~success)

@@ -1,9 +1,10 @@
 """Friction and temperature as terms: every solver sees them, in every form."""
 
-import re
+import itertools
 
 import diffrax
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import lineax as lx
@@ -11,9 +12,9 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._solver import LANGEVIN
-from diffrax_symplectic._terms import FRICTION, semidefinite_root
+from diffrax_symplectic._terms import semidefinite_root
 
+from ..families import slow_except
 from ..problems import as_friction, Given, weak_path
 
 
@@ -179,32 +180,6 @@ def test_traced_frictions_and_temperatures_that_are_none_fail_alone():
     np.testing.assert_array_equal(run(rates, heats), [True] + [False] * 4)
 
 
-@pytest.mark.slow
-def test_every_other_solver_sees_friction_and_noise():
-    # The end of a fine solution by Diffrax's solver, which all others approach.
-    y0 = jnp.ones(3), jnp.array([0.3, -0.2, 0.5])
-    for friction in FRICTIONS["matrix"][0], FRICTIONS["matrix at q"][0]:
-        path = diffrax.VirtualBrownianTree(
-            0.0, 0.5, 1e-4, (3,), jr.key(2), levy_area=diffrax.SpaceTimeLevyArea
-        )
-        terms = ds.langevin_terms(_pendula, friction, T, path)
-        steps = lambda solver, n: (
-            diffrax.diffeqsolve(terms, solver, 0.0, 0.5, 0.5 / n, y0, max_steps=n).ys
-        )
-        exact = np.stack(steps(diffrax.Heun(), 1024))[:, -1]
-        solvers = [ds.ImplicitMidpoint(), *(kind() for kind in LANGEVIN)]
-        if not callable(friction):
-            solvers += [ds.SRKs4(), diffrax.ShARK(), diffrax.Euler()]
-        for solver in solvers:
-            end = np.stack(steps(solver, 64))[:, -1]
-            # Momenta that are late by half a step.
-            late = 4 if isinstance(solver, ds.LangevinMiddle) else 1
-            np.testing.assert_allclose(end, exact, atol=0.03 * late)
-        for solver in (ds.StormerVerlet(), ds.SRKw4()):
-            with pytest.raises(ValueError, match=re.escape(FRICTION)):
-                solver.init(terms, 0.0, 0.1, y0, None)
-
-
 def test_two_baths_have_the_mean_temperature_that_their_frictions_weigh():
     H0 = lambda t, p, q, args: p**2 / 2 + q**2 / 2
 
@@ -349,3 +324,103 @@ def test_a_matrix_for_momenta_with_two_axes_is_an_operator_on_their_structure():
     B, _ = noise.vf(0.0, (q, q), None)
     B = B.reshape(n * d, n * d)
     np.testing.assert_allclose(B @ B.T, 2 * T * flat, atol=1e-13)
+
+
+# Of a friction or temperature that is zero for some momenta or somewhere.
+PAIR = jnp.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
+
+
+MANY = 17
+
+
+# The friction and the temperature as functions of a number. Both are zero somewhere.
+ZERO_SOMEWHERE = {
+    "number": (lambda a: a, lambda a: a * jnp.array([1.0, 0.0, 2.0])),
+    "no temperature": (lambda a: a, lambda a: 0 * a),
+    "array": (lambda a: a * jnp.array([1.0, 0.0, 2.0]), lambda a: a),
+    "matrix": (lambda a: as_friction(a * PAIR), lambda a: a),
+    "zero matrix": (lambda a: as_friction(0 * a * PAIR), lambda a: a),
+    "large matrix": (
+        lambda a: as_friction(a * jnp.zeros((MANY, MANY)).at[:3, :3].set(PAIR)),
+        lambda a: a,
+    ),
+    "wall": (lambda a: lambda t, q, args: a * jnp.maximum(q - 1, 0), lambda a: a),
+    "matrix at q": (
+        lambda a: lambda t, q, args: as_friction(a * jnp.maximum(q[2] - 1, 0) * PAIR),
+        lambda a: a,
+    ),
+    "heated side": (
+        lambda a: a,
+        lambda a: lambda t, q, args: a * jnp.maximum(q - 1, 0),
+    ),
+    "tree": (
+        lambda a: {"x": a * jnp.array([1.0, 0.0]), "y": 0 * a},
+        lambda a: {"x": a, "y": a},
+    ),
+    "along": (
+        lambda a: ds.FrictionAlong(a * jnp.array([[1.0, 0.0], [-1.0, 0.0], [0, 0]])),
+        lambda a: 0 * a,
+    ),
+}
+
+
+def _energy(t, p, q, args):
+    momenta = jax.tree.leaves(p)
+    positions = jax.tree.leaves(q)
+    kinetic = sum(jnp.sum(x**2) for x in momenta) / 2
+    return kinetic + sum(jnp.sum(jnp.cos(x)) for x in positions)
+
+
+def _start(name, shift):
+    """Positions on both sides of the wall."""
+    number = MANY if name == "large matrix" else 3
+    p = jnp.linspace(0.3, 0.5, number)
+    q = jnp.linspace(0.2, 1.7, number) + shift
+    if name != "tree":
+        return p, q
+    return tuple({"x": x[:2], "y": x[2]} for x in (p, q))
+
+
+QUICK = [(ds.BAOAB(), "array"), (ds.BAOAB(), "matrix")]
+
+
+# Each of the others once, with the one or the other solver in turn.
+OTHERS = zip(itertools.cycle([ds.BAOAB(), ds.ImplicitMidpoint()]), ZERO_SOMEWHERE)
+
+
+ALL = [*QUICK, *(case for case in OTHERS if case not in QUICK)]
+
+
+@pytest.mark.parametrize("case", slow_except(QUICK, ALL), ids=str)
+def test_derivatives_by_roots_of_zero_are_finite_and_those_of_differences(case):
+    solver, name = case
+    friction, temperature = ZERO_SOMEWHERE[name]
+
+    def end(x):
+        a, shift = x
+        y0 = _start(name, shift)
+        # One increment for each momentum, or for each direction.
+        like = jnp.zeros(2) if name == "along" else y0[1]
+        flat, unravel = jfu.ravel_pytree(like)
+        noise = unravel(0.3 * jnp.cos(7.0 * jnp.arange(flat.size)))
+        terms = ds.langevin_terms(_energy, friction(a), temperature(a), Given(noise))
+        state = solver.init(terms, 0.0, 0.3, y0, None)
+        y1, *_ = solver.step(terms, 0.0, 0.3, y0, None, state, False)
+        return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(y1))
+
+    points = jnp.array([[0.7, 0.0], [1.3, 0.05]])
+    forward = jax.jit(jax.vmap(jax.jacfwd(end)))(points)
+    # One program for the gradients and for the values that are compared to them.
+    units = 1e-5 * jnp.concatenate([jnp.zeros((1, 2)), jnp.eye(2), -jnp.eye(2)])
+    moved = (points[:, None] + units).reshape(10, 2)
+    values, gradients = jax.jit(jax.vmap(jax.value_and_grad(end)))(moved)
+    plus, minus = jnp.split(values.reshape(2, 5)[:, 1:], 2, axis=1)
+    exact, backward = (plus - minus) / 2e-5, gradients[::5]
+    assert np.all(np.abs(exact[:, 1]) > 1e-3)
+    np.testing.assert_allclose(forward, exact, rtol=1e-6, atol=1e-9)
+    if name == "matrix":
+        # Of second derivatives by the friction, too.
+        second = jax.jit(jax.vmap(jax.jacfwd(jax.grad(end))))(points)[:, :, 0]
+        differences = (gradients[1::5] - gradients[3::5]) / 2e-5
+        np.testing.assert_allclose(second, differences, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(backward, exact, rtol=1e-6, atol=1e-9)

@@ -242,30 +242,6 @@ def test_terms_may_come_in_any_order_nested_and_drift_in_pieces():
         np.testing.assert_allclose(got, expected, rtol=1e-13)
 
 
-@pytest.mark.slow
-def test_order_three_halves_holds_backwards_in_time():
-    solver = ds.PlateauVerlet()
-    energy = lambda t, p, q, args: jnp.sum(p**2 / 2 + q**4 / 4)
-    kick = lambda t, p, q, args: -q
-    y0 = (jnp.array([0.2]), jnp.array([1.0]))
-
-    def errors(key):
-        area = diffrax.SpaceTimeLevyArea
-        tree = diffrax.VirtualBrownianTree(0.0, 1.0, 2.0**-13, (1,), key, area)
-        path = ds.PlateauBrownianPath(tree, jr.key(0))
-        end = lambda h: diffrax.diffeqsolve(
-            *(ds.hamiltonian_terms(energy, kick, path), solver, 1.0, 0.0, -h, y0),
-            **_END,
-        ).ys[1][-1, 0]
-        coarse, fine, exact = jax.lax.map(end, jnp.array([1 / 8, 1 / 32, 2.0**-9]))
-        return coarse - exact, fine - exact
-
-    # At order 1 it is a factor of 4, and an error ten times as large.
-    coarse, fine = jax.jit(jax.vmap(errors))(jr.split(jr.key(1), 50))
-    assert jnp.sqrt(jnp.mean(coarse**2)) < 5e-3
-    assert jnp.sqrt(jnp.mean(fine**2)) < jnp.sqrt(jnp.mean(coarse**2)) / 6
-
-
 def test_integer_times_are_times():
     moving = lambda t, p, q, args: jnp.sum(p**2 / 2 + jnp.cos(3 * t) * q)
     terms = ds.hamiltonian_terms(

@@ -200,22 +200,6 @@ def in_ticks(ticks):
     return ds.hamiltonian_terms(energy, noise, ())
 
 
-@pytest.mark.slow
-def test_means_are_the_same_numbers_in_every_unit_of_time():
-    # Sorted paths take their random words by the number of a step, not by its times. The
-    # kink asks for Gaussian increments.
-    def mean(ticks):
-        return ds.expectation(
-            lambda t, y, args: jnp.abs(y[1]), in_ticks(ticks), MIDPOINT,
-            0, 2 * ticks, 0.2 * ticks, ONE, key=jr.key(0), levels=2,
-            sampling=ds.ArrayRQMC(2**8, 2), ts=[1 * ticks, 2 * ticks],
-        )  # fmt: skip
-
-    for ticks in (1e3, 1e-3):
-        np.testing.assert_allclose(mean(ticks).mean, mean(1.0).mean, rtol=1e-12)
-        np.testing.assert_allclose(mean(ticks).error, mean(1.0).error, rtol=1e-9)
-
-
 def test_laws_with_multiplicative_noise_are_exact_in_every_unit_of_time():
     ticks, h = 1e-6, 0.02
     path = ds.FixedStepBrownianPath((), jr.key(0))
@@ -245,12 +229,3 @@ def test_a_bath_is_as_hot_where_phi_has_kinks():
         key=jr.key(0), sampling=ds.IndependentPaths(20_000), levels=1,
     )  # fmt: skip
     assert abs(estimate.mean - np.sqrt(2 / np.pi)) < 4 * estimate.std_error
-
-
-@pytest.mark.slow
-def test_long_steps_are_compared_too():
-    terms = ds.langevin_terms(WELL, 0.5, 1.0, ())
-    got = ds.compare_solvers(
-        terms, [MIDPOINT], 0.0, 2.0, [1.0], ONE, key=jr.key(0), num_paths=10
-    )
-    assert np.isfinite(got.steps[0].error) and got.steps[0].num_failed == 0

@@ -1,4 +1,4 @@
-"""Increments that are cut off: their bound, their error, and bad input."""
+"""Paths around others: increments that are cut off, and plateaus."""
 
 import itertools
 
@@ -11,7 +11,7 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from ..problems import Given
+from ..problems import Given, weak_path
 
 
 def test_truncated_path_clips_and_keeps_the_levy_area():
@@ -74,3 +74,39 @@ def test_an_empty_step_has_no_increment():
     # In a batch, paths that have ended take empty steps until all have.
     path = ds.TruncatedBrownianPath(Given(jnp.array([5.0, -5.0])), k=1)
     np.testing.assert_array_equal(path.evaluate(0.5, 0.5), [0.0, 0.0])
+
+
+def test_plateaus_are_fair_and_have_the_mean_square_of_the_path():
+    h = 0.25
+    tree = diffrax.UnsafeBrownianPath((100_000,), jr.key(0), diffrax.SpaceTimeLevyArea)
+    path = ds.PlateauBrownianPath(tree, jr.key(1))
+    first = path.evaluate(0.0, h, use_levy=True)
+    again = path.evaluate(1e-12, h, use_levy=True)
+    np.testing.assert_array_equal(np.sign(first.C), np.sign(again.C))
+    # The parabola through what is known of the path, and the mean square of the rest,
+    # h / 2 - h (1 / 3 + 1 / 10).
+    points, weights = np.polynomial.legendre.leggauss(3)
+    u = (1 + points[:, None]) / 2
+    parabola = first.W * u + 6 * first.H * u * (1 - u)
+    mean, square = (weights / 2 @ x for x in (parabola, parabola**2))
+    np.testing.assert_allclose(mean**2 + first.C**2, square + h / 15, rtol=1e-12)
+    assert abs(np.mean(first.C**2) - h / 6) <= 4 * np.std(first.C**2) / np.sqrt(100_000)
+    bound = 4 * np.sqrt(h / 6) / np.sqrt(100_000)
+    assert abs(np.mean(first.C)) <= bound
+    later = path.evaluate(h, 2 * h, use_levy=True)
+    for other in (first.W, first.H, later.C):
+        assert abs(np.mean(first.C * other)) <= bound * np.std(other)
+    back = jax.tree.map(lambda x: -x, first)
+    np.testing.assert_array_equal(back.C, -first.C)
+
+
+def test_plateaus_and_levy_areas_need_a_path_with_areas():
+    for wrapper in (ds.PlateauBrownianPath, ds.LevyAreaBrownianPath):
+        with pytest.raises(ValueError, match="needs a path with space-time"):
+            wrapper(weak_path(2), jr.key(0))
+    levy = diffrax.SpaceTimeLevyArea
+    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 0.1, (1,), jr.key(0), levy)
+    with pytest.raises(ValueError, match="`num_terms` must be"):
+        ds.LevyAreaBrownianPath(tree, jr.key(0), num_terms=-1)
+    with pytest.raises(ValueError, match="`cell` must be"):
+        ds.LevyAreaBrownianPath(tree, jr.key(0), cell=0.0)
