@@ -9,8 +9,6 @@ import pytest
 from diffrax_symplectic._root_finder import differentiate
 from diffrax_symplectic._root_finder.linear import solve
 
-from ..families import slow_except
-
 
 # The first ones are written out.
 @pytest.mark.parametrize(
@@ -76,9 +74,11 @@ def test_units_make_no_difference_to_linear_systems(n):
 
 @pytest.mark.parametrize(
     "n, dtype",
-    slow_except(
-        [(3, jnp.float64)], [(3, jnp.float64), (3, jnp.float32), (40, jnp.float64)]
-    ),
+    [
+        (3, jnp.float64),
+        pytest.param(3, jnp.float32, marks=pytest.mark.slow),
+        pytest.param(40, jnp.float64, marks=pytest.mark.slow),
+    ],
 )
 def test_derivatives_are_solved_whether_iteration_converges_or_not(n, dtype):
     # Symmetric and antisymmetric matrices, of spectral radii on both sides of one and of

@@ -12,7 +12,7 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from ..families import slow_except
+from ..picard import by_picard
 from ..problems import (
     H0,
     noise,
@@ -72,8 +72,8 @@ def test_state_and_noise_may_be_any_pytrees():
     def all_at_once(y):
         vf = diffusion.vf(0.0, y, None)
         products = diffusion.prod(vf, control), diffusion.vf_prod(0.0, y, None, control)
-        defect = ds.symplecticity_defect(terms, ds.ImplicitMidpoint(), 0.0, 0.1, y)
-        return vf, products, defect
+        solver = by_picard(ds.ImplicitMidpoint())
+        return vf, products, ds.symplecticity_defect(terms, solver, 0.0, 0.1, y)
 
     vf, products, defect = all_at_once((p, q))
     assert vf[0]["x"].shape == (1, 2, 3)
@@ -92,14 +92,11 @@ def test_one_noise_may_be_a_scalar():
 
 @pytest.mark.parametrize(
     "m, solver",
-    slow_except(
-        [(3, diffrax.StratonovichMilstein())],
-        [
-            (1, diffrax.Heun()),
-            (3, diffrax.StratonovichMilstein()),
-            (3, diffrax.SlowRK()),
-        ],
-    ),
+    [
+        (3, diffrax.StratonovichMilstein()),
+        pytest.param(1, diffrax.Heun(), marks=pytest.mark.slow),
+        pytest.param(3, diffrax.SlowRK(), marks=pytest.mark.slow),
+    ],
 )
 def test_terms_work_with_diffrax_solvers(m, solver):
     y0, args = random_problem(jr.key(0), 2, m)
@@ -116,7 +113,7 @@ def test_terms_work_with_diffrax_solvers(m, solver):
 
 def test_plain_diffrax_terms_give_the_same_step():
     # It treats drift and noise differently, and so tells them apart.
-    solver = ds.StrangGauss()
+    solver = by_picard(ds.StrangGauss())
     y0, args = random_problem(jr.key(0), 2, 2)
     path = weak_path(2)
     terms = ds.hamiltonian_terms(H0, noise, path)
@@ -227,7 +224,7 @@ def test_terms_may_come_in_any_order_nested_and_drift_in_pieces():
     )
 
     def step(*terms):
-        solver, terms = ds.StrangGauss(), diffrax.MultiTerm(*terms)
+        solver, terms = by_picard(ds.StrangGauss()), diffrax.MultiTerm(*terms)
         assert solver.weak_order(terms) == 2
         return solver.step(terms, 0.0, 0.1, y0, args, None, False)[0]
 
@@ -249,7 +246,7 @@ def test_integer_times_are_times():
     )
     y0 = (jnp.array([0.2]), jnp.array([1.0]))
     value = lambda t0, t1: ds.step_expectation(
-        terms, ds.AdditiveGauss(), t0, t1, y0, fn=lambda t, y, args: y[1][0]
+        terms, by_picard(ds.AdditiveGauss()), t0, t1, y0, fn=lambda t, y, args: y[1][0]
     )
     np.testing.assert_allclose(value(0, 1), value(0.0, 1.0), rtol=1e-14)
 

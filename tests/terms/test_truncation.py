@@ -17,8 +17,6 @@ from diffrax_symplectic._brownian import lost_variance
 from diffrax_symplectic._simulation import Problem
 from diffrax_symplectic._terms import brownian_paths, step_variables
 
-from ..families import slow_except
-
 
 ONE = jnp.array(0.0), jnp.array(1.0)
 MIDPOINT = ds.ImplicitMidpoint()
@@ -32,10 +30,15 @@ def follow(terms, solver, h, steps, **options):
     return ds.ensemble(terms, solver, 0, h * steps, h, ONE, **options)
 
 
+def made_terms(terms):
+    """The terms with the paths that the midpoint rule gets."""
+    given = lambda t, y, args: y[1], terms, MIDPOINT, 0.0, 0.01, 0.01, ONE, None, None
+    return Problem.of(*given, levels=1, want="strong").terms
+
+
 def kinds(terms):
     """Which noises of these terms get truncated paths from the midpoint rule."""
-    given = lambda t, y, args: y[1], terms, MIDPOINT, 0.0, 0.01, 0.01, ONE, None, None
-    made = [Problem.of(*given, levels=1, want="strong").terms]
+    made = [made_terms(terms)]
     # In a bath the midpoint rule is not suggested first, and for noise in the forces later.
     suggested = ds.suggest_solver(terms, 0.0, ONE, want="strong")
     own = [s for s in suggested if type(s.solver) is ds.ImplicitMidpoint]
@@ -67,7 +70,8 @@ def test_paths_of_the_user_are_kept_but_not_in_a_bath():
     cut = MIDPOINT.path((), jr.key(0))
     assert isinstance(cut, ds.TruncatedBrownianPath)
     given = ds.hamiltonian_terms(WELL, KICK, cut)
-    assert kinds(given) == (True,)
+    (path,) = brownian_paths(made_terms(given))
+    assert isinstance(path, ds.TruncatedBrownianPath)
     for make in (ds.langevin_terms, ds.bath_terms):
         (path,) = brownian_paths(make(WELL, 0.5, 1.0, cut))
         assert isinstance(path, ds.FixedStepBrownianPath)
@@ -109,16 +113,13 @@ def assert_moments(y, exact):
             assert abs(x.mean() - exact[i, j]) < bound + 1e-12
 
 
-def with_steps(*others):
-    """One step of the midpoint rule, and other solvers with others."""
-    cases = [(MIDPOINT, 0.5), *others]
-    return pytest.mark.parametrize("solver, h", slow_except(cases[:1], cases), ids=repr)
+def each_step(h):
+    """A step of the midpoint rule, and a slow one of another solver."""
+    cases = [(MIDPOINT, h), pytest.param(ds.SRKs1(), 0.25, marks=pytest.mark.slow)]
+    return pytest.mark.parametrize("solver, h", cases)
 
 
-@pytest.mark.parametrize(
-    "solver, h",
-    [(MIDPOINT, 2.0), pytest.param(ds.SRKs1(), 0.25, marks=pytest.mark.slow)],
-)
+@each_step(2.0)
 def test_the_law_with_additive_noise_is_exact_at_every_step(solver, h):
     # A linear system: the law is Gaussian, with these moments.
     kicked = ds.hamiltonian_terms(WELL, KICK, ())
@@ -156,7 +157,7 @@ def truncated_moments(solver, h, unit=1.0):
     return np.einsum("k, ik, jk -> ij", weights, y, y)
 
 
-@with_steps((ds.SRKs1(), 2.0))
+@each_step(0.5)
 def test_with_multiplicative_noise_made_paths_lose_little(solver, h):
     # One step over the whole interval is the longest of all.
     with warnings.catch_warnings():
@@ -168,7 +169,7 @@ def test_with_multiplicative_noise_made_paths_lose_little(solver, h):
     assert_moments(paths.ys, truncated_moments(solver, h, 32 * h))
 
 
-@with_steps((ds.SRKs2(), 0.25))
+@each_step(0.5)
 def test_what_paths_of_the_user_lose_with_multiplicative_noise_is_said(solver, h):
     path = solver.path((), jr.key(0), want="strong")
     terms = ds.hamiltonian_terms(WELL, SPRING, path)
