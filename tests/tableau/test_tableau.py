@@ -107,8 +107,8 @@ UNKNOWN = [
     (ds.SRKs3(a=0.25), [1, 1, 0]),
     (ds.StormerVerlet(), [0, 0, 0]),
     (ds.PlateauVerlet(), [0] * 12),
-    (ds.SRKw5(), [1, 0]),
-    (ds.SRKs4(), [1, 1, 0]),
+    (ds.SRKw5(), [0, 0, 1]),
+    (ds.SRKs4(), [0, 0, 0, 0, 1, 1]),
 ]
 
 
