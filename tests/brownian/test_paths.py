@@ -188,6 +188,9 @@ def test_the_same_key_gives_the_same_path_in_every_version():
     # in units of 2^e, shifted by 0.29.
     for step, place in (
         ((0.0, 0.25), (1, -3)),
+        # On both sides of a count: 1.70 + 0.29 and 1.72 + 0.29.
+        ((0.0875, 0.3375), (1, -3)),
+        ((0.09, 0.34), (2, -3)),
         ((7.5, 7.75), (61, -3)),
         ((-3.0, -2.9), (-47, -4)),
         ((100.0, 101.0), (201, -1)),
