@@ -265,13 +265,9 @@ def test_nested_batches_are_served_as_one():
 
 
 @pytest.mark.parametrize(
-    "solver, d",
-    [
-        pytest.param(ds.StrangGauss(), 4, marks=pytest.mark.slow),
-        (ds.ImplicitMidpoint(), 32),
-    ],
-    ids=str,
+    "solver, d", [(ds.StrangGauss(), 4), (ds.ImplicitMidpoint(), 32)], ids=str
 )
+@pytest.mark.slow
 def test_steps_of_many_unknowns_are_symplectic(solver, d):
     def potential(t, p, q, args):
         stretch = jnp.diff(q, prepend=0.0, append=0.0)

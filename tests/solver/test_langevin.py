@@ -207,11 +207,16 @@ def test_terms_of_diffrax_are_taken_as_they_are(solver):
         jnp.sum(U * p**2 / 2 + q**4 / 4 - args * jnp.cos(q)) - jnp.cos(t) * jnp.sum(q)
     )
     ours = ds.langevin_terms(energy, GAMMA / U, 1.0, path)
-    for t1 in (1.0, -1.0):
+
+    @jax.jit
+    def solve_both(t1):
         solve = lambda terms, y0: (
             diffrax.diffeqsolve(terms, solver, 0.0, t1, t1 / 8, y0, 0.3, max_steps=8).ys
         )
-        theirs, expected = solve(both, (x, v)), solve(ours, (v / U, x))
+        return solve(both, (x, v)), solve(ours, (v / U, x))
+
+    for t1 in (1.0, -1.0):
+        theirs, expected = solve_both(t1)
         np.testing.assert_allclose(theirs[0], expected[1], atol=1e-14)
         np.testing.assert_allclose(theirs[1], U * expected[0], atol=1e-14)
 

@@ -97,6 +97,7 @@ def test_spinors_of_spins_give_them_back_with_their_derivatives_everywhere(dtype
     assert np.max(sizes) <= 32 * eps
 
 
+@pytest.mark.slow
 def test_step_is_a_poisson_map_for_a_thousand_random_systems():
     # A symplectic step for (p, q) is a Poisson map for s, whatever the solver, and every
     # solver has a test that its steps are symplectic.

@@ -93,11 +93,12 @@ def test_one_noise_may_be_a_scalar():
 @pytest.mark.parametrize(
     "m, solver",
     [
+        (1, diffrax.Heun()),
         (3, diffrax.StratonovichMilstein()),
-        pytest.param(1, diffrax.Heun(), marks=pytest.mark.slow),
-        pytest.param(3, diffrax.SlowRK(), marks=pytest.mark.slow),
+        (3, diffrax.SlowRK()),
     ],
 )
+@pytest.mark.slow
 def test_terms_work_with_diffrax_solvers(m, solver):
     y0, args = random_problem(jr.key(0), 2, m)
     # Steps of the same size see the same increments.

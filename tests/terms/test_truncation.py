@@ -201,6 +201,7 @@ def in_ticks(ticks):
     return ds.hamiltonian_terms(energy, noise, ())
 
 
+@pytest.mark.slow
 def test_laws_with_multiplicative_noise_are_exact_in_every_unit_of_time():
     ticks, h = 1e-6, 0.02
     path = ds.FixedStepBrownianPath((), jr.key(0))
