@@ -12,8 +12,7 @@ from scipy import special
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import random as words
 from diffrax_symplectic._brownian.random import normal_from_words
-
-from ..problems import kubo_terms
+from diffrax_symplectic._solver import common_path, path_of_array_cell
 
 
 AREA = diffrax.SpaceTimeLevyArea
@@ -44,26 +43,6 @@ def test_each_word_has_its_quantile(dtype, rtol):
     near = np.unique((words[:, None] + np.arange(3, dtype=np.uint32)).ravel())
     steps = np.diff(np.asarray(normal_from_words(jnp.asarray(near), jnp.float64)))
     assert np.all(steps > 0)
-
-
-def test_moments_to_the_eighth_are_those_of_the_normal_distribution():
-    # The mean over all 2^32 words: by the rule of Gauss and Legendre in each octave of
-    # words, whose spacing is far below the length of all but the first, which are summed.
-    rare = np.arange(2**12, dtype=np.uint32)
-    x, weights = np.polynomial.legendre.leggauss(32)
-    starts = 2.0 ** np.arange(12, 31)
-    # Midpoints of words: the integral over [a - 1/2, 2 a - 1/2) is their sum.
-    nodes = starts[:, None] * (1.5 + x / 2) - 0.5
-    near = np.round(nodes).astype(np.uint32)
-    value = np.asarray(normal_from_words(jnp.asarray(near), jnp.float64))
-    # From the nearest word to the node, along the density's slope.
-    density = np.exp(-(value**2) / 2) / np.sqrt(2 * np.pi)
-    value = value + (nodes - near) / 2**32 / density
-    tail = np.asarray(normal_from_words(jnp.asarray(rare), jnp.float64))
-    for k, exact, rtol in ((2, 1, 1e-7), (4, 3, 1e-6), (6, 15, 2e-6), (8, 105, 1e-5)):
-        octaves = np.sum(value**k * weights * starts[:, None] / 2)
-        mean = 2 * (octaves + np.sum(tail**k)) / 2**32
-        np.testing.assert_allclose(mean, exact, rtol=rtol)
 
 
 def test_sampled_steps_and_noises_are_independent_with_the_right_variance():
@@ -116,68 +95,6 @@ def test_steps_of_cells_are_sums_and_areas_of_one_motion(dtype):
         Exception, match="`FixedStepBrownianPath` with `cell` must begin"
     ):
         jax.block_until_ready(evaluate(t[0], t[0] + dtype(1.5 * cell)))
-
-
-def test_areas_of_composed_steps_have_their_variances():
-    n, h = 20_000, 0.5
-    path = lambda key: ds.FixedStepBrownianPath((), key, AREA, cell=h / 3)
-    draw = lambda key: path(key).evaluate(h, 2 * h, use_levy=True)
-    inc = jax.jit(jax.vmap(draw))(jr.split(jr.key(1), n))
-    for sample, exact, size in (
-        (inc.W**2, h, np.sqrt(2) * h),
-        (inc.H**2, h / 12, np.sqrt(2) * h / 12),
-        (inc.W * inc.H, 0, h / np.sqrt(12)),
-    ):
-        assert abs(np.mean(sample) - exact) <= 4 * size / np.sqrt(n)
-
-
-Y0 = (jnp.array(0.2), jnp.array(1.0))
-
-
-def _end(path, h, y0=Y0):
-    terms = kubo_terms(path, 0.4)
-    return diffrax.diffeqsolve(terms, diffrax.Heun(), 0.0, 1.0, h, y0).ys[1][-1]
-
-
-def test_solutions_with_steps_h_and_half_of_it_are_strongly_close():
-    # Strong order 1, so the difference halves with h; of independent paths it would not.
-    def differences(key):
-        path = ds.FixedStepBrownianPath((), key, cell=2.0**-7)
-        # One program for all step sizes.
-        return jax.lax.map(lambda h: _end(path, h), 2.0 ** -jnp.arange(4, 8))
-
-    ends = np.asarray(jax.jit(jax.vmap(differences))(jr.split(jr.key(2), 200)))
-    coarse, middle, fine = np.sqrt(np.mean(np.diff(ends, axis=1) ** 2, axis=0))
-    assert coarse < 0.02
-    assert 1.6 < coarse / middle < 2.5 and 1.6 < middle / fine < 2.5
-
-
-@pytest.mark.parametrize("cell", [None, 0.125])
-def test_reverse_mode_sees_the_same_increments(cell):
-    def end(p):
-        path = ds.FixedStepBrownianPath((), jr.key(3), AREA, cell=cell)
-        return _end(path, 0.25, (p, Y0[1]))
-
-    value_and_grad, step = jax.jit(jax.value_and_grad(end)), 1e-6
-    _, reverse = value_and_grad(Y0[0])
-    plus, minus = (value_and_grad(Y0[0] + x)[0] for x in (step, -step))
-    np.testing.assert_allclose(reverse, (plus - minus) / (2 * step), rtol=1e-7)
-
-
-@pytest.mark.parametrize("cell", [None, 0.125])
-def test_backward_in_time_a_solve_returns_to_its_start(cell):
-    path = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((), jr.key(4), cell=cell))
-    terms = kubo_terms(path, 0.4)
-
-    @jax.jit
-    def solve(t0, t1, h, y0):
-        return diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), t0, t1, h, y0).ys
-
-    there = jax.tree.map(lambda x: x[-1], solve(0.0, 1.0, 0.25, Y0))
-    back = solve(1.0, 0.0, -0.25, there)
-    for a, b in zip(back, Y0):
-        np.testing.assert_allclose(a[-1], b, atol=1e-12)
-    assert abs(there[1] - Y0[1]) > 0.1
 
 
 def test_wrappers_make_the_same_step_from_words_as_from_keys():
@@ -252,3 +169,23 @@ def test_steps_shorter_than_the_tolerance_of_a_tree_are_an_error():
     for h, tol in ((0.09, 0.1), (0.1, 0.5)):
         with pytest.raises(Exception, match="Pass a smaller `tol`"):
             jax.block_until_ready(solve(jnp.array(h), tol))
+
+
+SOLVERS = [
+    ds.StormerVerlet(),
+    ds.PlateauVerlet(),
+    ds.LevyAreaMidpoint(),
+    diffrax.Heun(),
+]
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=lambda x: type(x).__name__)
+def test_a_cell_that_is_an_array_gives_the_same_motion(solver):
+    cell, key = 0.125, jr.key(4)
+    plain = common_path(solver, cell, (3,), key)
+    traced = path_of_array_cell(solver, np.asarray(cell), (3,), key)
+    over = jnp.asarray(0.5), jnp.asarray(0.5 + 4 * cell)
+    got = traced.evaluate(*over, use_levy=True)
+    exact = plain.evaluate(*over, use_levy=True)
+    for x, y in zip(jax.tree.leaves(got), jax.tree.leaves(exact), strict=True):
+        np.testing.assert_array_equal(x, y)

@@ -122,3 +122,12 @@ def test_areas_keep_their_sign_backward_in_time_and_nobody_else_scales_them():
         got = drawn_variables((term,), ["W", "H"], t0, t1, "")
         np.testing.assert_array_equal(got["W"][0], sign * inc.W)
         np.testing.assert_array_equal(got["H"][0], inc.H)
+
+
+def test_four_point_variables_have_seven_moments():
+    # Whose words have their values and weights by `test_laws`.
+    values, weights = laws_of(weak_path(1, order=3))["W"].outcomes(5)
+    for n, exact in enumerate((1, 0, 1, 0, 3, 0, 15, 0)):
+        np.testing.assert_allclose(weights @ values**n, exact, rtol=1e-14, atol=1e-14)
+    with pytest.raises(ValueError, match="`order` must be 2 or 3"):
+        weak_path(1, order=4)

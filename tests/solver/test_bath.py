@@ -68,8 +68,9 @@ def _exact(friction, sign=1, h=0.1):
     return P + np.linalg.solve(np.eye(N) + h / 2 * A, right)
 
 
-@pytest.mark.parametrize("friction", [FULL, PAIRS], ids=["full", "pairs"])
-@pytest.mark.parametrize("backward", [False, True])
+@pytest.mark.parametrize(
+    "friction, backward", [(FULL, False), (PAIRS, True)], ids=["full", "pairs back"]
+)
 def test_friction_by_its_modes_solves_the_equation_of_the_step(friction, backward):
     (term,) = _friction_term(friction)
     wrapped = _seen_by_a_solver(term, backward)
@@ -77,11 +78,6 @@ def test_friction_by_its_modes_solves_the_equation_of_the_step(friction, backwar
     got = _after(friction, (wrapped,))
     sign = -1 if backward else 1
     np.testing.assert_allclose(got, _exact(friction, sign), rtol=0, atol=1e-13)
-
-
-def test_friction_between_particles_by_its_modes_conserves_their_momentum():
-    after = _after(PAIRS)
-    assert abs(jnp.sum(after) - jnp.sum(P) - jnp.sum(KICK)) < 1e-13
 
 
 def test_modes_serve_what_is_the_same_at_all_times_and_positions_and_nothing_else():
@@ -105,23 +101,25 @@ def test_a_matrix_of_a_function_that_is_not_semidefinite_fails():
     assert np.all(np.isnan(_after(lambda t, q, args: -FULL)))
 
 
-@pytest.mark.parametrize("friction", [FULL, PAIRS, jnp.eye(N)])
-def test_derivatives_are_those_of_the_equation_also_for_equal_rates(friction):
+def test_derivatives_are_those_of_the_equation_also_for_equal_rates():
     # Derivatives of eigenvectors of equal eigenvalues are infinite.
     weights = jr.normal(jr.key(4), (N,))
 
-    def by_modes(scale):
+    def by_modes(scale, friction):
         after = _after(lambda t, q, args: args * friction, args=scale)
         return weights @ after
 
-    def by_solve(scale):
+    def by_solve(scale, friction):
         A = scale * friction @ INVERSE_MASSES
         right = -0.1 * A @ P + KICK
         return weights @ (P + jnp.linalg.solve(jnp.eye(N) + 0.05 * A, right))
 
     for derivative in (jax.grad, jax.jacfwd):
-        got = derivative(by_modes)(1.2)
-        np.testing.assert_allclose(got, derivative(by_solve)(1.2), rtol=1e-12)
+        got, exact = jax.jit(derivative(by_modes)), derivative(by_solve)
+        for friction in (FULL, jnp.eye(N)):
+            np.testing.assert_allclose(
+                got(1.2, friction), exact(1.2, friction), rtol=1e-12
+            )
 
 
 _PROGRAM = """

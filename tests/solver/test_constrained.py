@@ -1,10 +1,7 @@
 """Systems with constraints: the steps that keep them, and starts that satisfy them."""
 
-import functools as ft
-
 import diffrax
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
@@ -14,6 +11,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._solver.step import no_failure
 
 from ..drjit_here import needs_drjit
+from ..families import slow_except
 from ..problems import as_friction, Given
 
 
@@ -70,40 +68,14 @@ def take_steps(number, terms, h, y0, args=None, solver=None):
     return y, jnp.all(okay)
 
 
-@pytest.mark.parametrize(
-    "dtype, bound",
-    [
-        (jnp.float64, 1e-14),
-        pytest.param(jnp.float32, 1e-5, marks=pytest.mark.slow),
-    ],
-)
-def test_steps_are_symplectic_on_the_constrained_phase_space(dtype, bound):
+def test_steps_are_symplectic_on_the_constrained_phase_space():
     @jax.jit
     @jax.vmap
     def defect(key):
-        W = 0.3 * jr.normal(key, (2,))
-        y0, W = jax.tree.map(lambda x: x.astype(dtype), (chain_state(key), W))
-        terms = chain(Given(W))
-        at = terms, ds.StormerVerlet(), jnp.zeros((), dtype), jnp.full((), 0.1, dtype)
-        return ds.symplecticity_defect(*at, y0, jnp.full((), 0.5, dtype))
+        at = chain(Given(0.3 * jr.normal(key, (2,)))), ds.StormerVerlet(), 0.0, 0.1
+        return ds.symplecticity_defect(*at, chain_state(key), 0.5)
 
-    defects = defect(jr.split(jr.key(1), 50))
-    assert defects.dtype == dtype
-    assert np.max(defects) <= bound
-
-
-def test_the_way_back_is_the_way_there():
-    # With momenta reversed, and a wind that is even in time.
-    @jax.jit
-    @jax.vmap
-    def there_and_back(key):
-        terms, y0 = chain(Given(0.3 * jr.normal(key, (2,)))), chain_state(key)
-        (p, q), _ = take_step(terms, -0.05, 0.05, y0, 0.5)
-        (p, q), _ = take_step(terms, -0.05, 0.05, (-p, q), 0.5)
-        return y0, (-p, q)
-
-    begin, end = there_and_back(jr.split(jr.key(2), 20))
-    jax.tree.map(ft.partial(np.testing.assert_allclose, atol=1e-13), begin, end)
+    assert np.max(defect(jr.split(jr.key(1), 50))) <= 1e-14
 
 
 def pendulum_energy(t, p, q, args):
@@ -126,15 +98,6 @@ def solved(terms, t1, dt0, y0, args=None, **kwargs):
     return jax.tree.map(lambda x: x[-1], sol.ys)
 
 
-@pytest.mark.slow
-def test_a_hundred_thousand_steps_keep_constraints_and_energy():
-    p, q = solved(PENDULUM, 1e4, 0.1, LEVEL)
-    assert abs(rod(q, None)[0]) <= 1e-15
-    assert abs(p @ q) <= 1e-15
-    change = pendulum_energy(0, p, q, None) - pendulum_energy(0, *LEVEL, None)
-    assert abs(change) <= 3e-3
-
-
 def test_positions_and_momenta_are_those_of_the_angle_to_second_order():
     in_angle = lambda t, p, q, args: p**2 / 2 + jnp.sin(q)
     angle = ds.hamiltonian_terms(in_angle)
@@ -154,9 +117,13 @@ def test_positions_and_momenta_are_those_of_the_angle_to_second_order():
 
 
 def test_a_solve_backward_in_time_returns_to_the_start():
-    y1 = solved(PENDULUM, 1.0, 0.1, LEVEL)
-    sol = diffrax.diffeqsolve(PENDULUM, ds.StormerVerlet(), 1.0, 0.0, -0.1, y1)
-    begin = [x[-1] for x in sol.ys]
+    @jax.jit
+    def solve(t0, t1, y0):
+        at = PENDULUM, ds.StormerVerlet(), t0, t1, (t1 - t0) / 10, y0
+        sol = diffrax.diffeqsolve(*at, max_steps=16, adjoint=diffrax.ForwardMode())
+        return tuple(x[-1] for x in sol.ys)
+
+    begin = solve(1.0, 0.0, solve(0.0, 1.0, LEVEL))
     np.testing.assert_allclose(np.stack(begin), np.stack(LEVEL), atol=1e-13)
 
 
@@ -174,7 +141,7 @@ def test_derivatives_are_those_of_the_solution():
         args = {"mass": x[0], "length": x[1]}
         y0 = {"x": x[2:4]}, {"x": x[4:]}
         y0 = ds.constrained_state(terms, y0, args)
-        (p, q), _ = take_steps(3, terms, 0.1, y0, args)
+        (p, q), _ = take_step(terms, 0.0, 0.1, y0, args)
         return jnp.sum(p["x"] ** 3) + jnp.sum(q["x"] ** 3)
 
     x = jnp.array([1.3, 0.8, 0.3, 0.4, 0.6, 0.5])
@@ -228,7 +195,9 @@ def _distances(q, args):
 
 
 LINE = jnp.zeros((3, 2)), jnp.array([[-0.6, -0.8], [0.0, 0.0], [0.6, 0.8]])
-STARTS = pytest.mark.parametrize(
+
+
+@pytest.mark.parametrize(
     "terms, y0, advice",
     [
         (PENDULUM, OFF, "constrained_state"),
@@ -242,24 +211,20 @@ STARTS = pytest.mark.parametrize(
         ),
     ],
 )
-
-
-@STARTS
 def test_bad_starts_and_redundant_constraints_are_refused(terms, y0, advice):
     with pytest.raises(ValueError, match=advice):
         ds.StormerVerlet().init(terms, 0.0, 0.1, y0, None)
     with pytest.raises(Exception, match=advice):
-        solved(terms, 1.0, 0.1, y0)
+        jax.jit(lambda y0: ds.StormerVerlet().init(terms, 0.0, 0.1, y0, None))(y0)
 
 
-@pytest.mark.parametrize("terms, bad", [(PENDULUM, OFF), (TWICE, LEVEL)])
-def test_bad_starts_fail_alone_in_a_batch(terms, bad):
+def test_bad_starts_fail_alone_in_a_batch():
     solve = lambda y0: diffrax.diffeqsolve(
-        terms, ds.StormerVerlet(), 0, 1, 0.5, y0, throw=False
+        PENDULUM, ds.StormerVerlet(), 0, 1, 0.5, y0, throw=False
     )
-    starts = jax.tree.map(lambda *x: jnp.stack(x), LEVEL, bad)
+    starts = jax.tree.map(lambda *x: jnp.stack(x), LEVEL, OFF)
     okay = jax.jit(jax.vmap(solve))(starts).result == diffrax.RESULTS.successful
-    np.testing.assert_array_equal(okay, [terms is PENDULUM, False])
+    np.testing.assert_array_equal(okay, [True, False])
 
 
 def test_atoms_on_a_line_stay_there_and_turn_as_one():
@@ -270,17 +235,11 @@ def test_atoms_on_a_line_stay_there_and_turn_as_one():
     terms = ds.hamiltonian_terms(_free, constraint=straight)
     # Both ends are 1 from the middle, and have the speed 1.
     p = jnp.array([[0.8, -0.6], [0.0, 0.0], [-0.8, 0.6]])
-    ends = []
-    for h in (0.02, 0.01):
-        number = round(1.5 / h)
-        (_, q), okay = take_steps(number, terms, h, (p, LINE[1]))
-        assert bool(okay)
-        np.testing.assert_allclose(q[1], (q[0] + q[2]) / 2, atol=1e-14)
-        ends.append(q[2])
+    (_, q), okay = take_steps(150, terms, 0.01, (p, LINE[1]))
+    assert bool(okay)
+    np.testing.assert_allclose(q[1], (q[0] + q[2]) / 2, atol=1e-14)
     exact = np.cos(1.5) * LINE[1][2] + np.sin(1.5) * p[2]
-    coarse, fine = (np.linalg.norm(end - exact) for end in ends)
-    # The step is of second order.
-    assert fine < 1e-4 and 3.9 < coarse / fine < 4.1
+    assert np.linalg.norm(q[2] - exact) < 1e-4
 
 
 def test_a_state_is_projected_in_the_metric_of_the_masses():
@@ -347,26 +306,24 @@ def test_what_makes_no_sense_with_constraints_refuses_them():
     terms = chain(ds.WeakBrownianPath((2,), jr.key(0)))
     y0 = chain_state(jr.key(5))
     at = terms, ds.StormerVerlet(), 0.0, 0.1, y0, 0.5
-    with pytest.raises(
-        ValueError, match="`second_moment_map` takes no constrained terms"
+    fn = lambda t, y, args: y[0]
+    for name, call in (
+        ("second_moment_map", lambda: ds.second_moment_map(*at)),
+        ("weak_order_defect", lambda: ds.weak_order_defect(*at, fn=fn, order=1)),
+        (
+            "ReversingAdjoint",
+            lambda: solved(terms, 1.0, 0.1, y0, 0.5, adjoint=ds.ReversingAdjoint()),
+        ),
     ):
-        ds.second_moment_map(*at)
-    with pytest.raises(
-        ValueError, match="`weak_order_defect` takes no constrained terms"
-    ):
-        ds.weak_order_defect(*at, fn=lambda t, y, args: y[0], order=1)
-    with pytest.raises(
-        ValueError, match="`ReversingAdjoint` takes no constrained terms"
-    ):
-        solved(terms, 1.0, 0.1, y0, 0.5, adjoint=ds.ReversingAdjoint())
+        with pytest.raises(ValueError, match=f"`{name}` takes no constrained terms"):
+            call()
     two = diffrax.MultiTerm(*terms.terms, *PENDULUM.terms)
     with pytest.raises(ValueError, match="Only one of the terms"):
         solved(two, 1.0, 0.1, y0, 0.5)
 
 
-@pytest.mark.parametrize(
-    "constraint, message",
-    [
+def test_constraints_of_another_kind_are_refused():
+    for constraint, message in (
         (lambda q, args: jnp.sum(q**2) - 1, "real array of shape"),
         (lambda q, args: (q[0],), "real array of shape"),
         (lambda q, args: q[:, None], "real array of shape"),
@@ -374,27 +331,22 @@ def test_what_makes_no_sense_with_constraints_refuses_them():
         (lambda q, args: q > 0, r"real array of shape .*got bool\["),
         (lambda q: q, "is called as `constraint"),
         (3.0, "must be a function"),
-    ],
-)
-def test_constraints_of_another_kind_are_refused(constraint, message):
-    with pytest.raises(ValueError, match=message):
-        terms = ds.hamiltonian_terms(pendulum_energy, constraint=constraint)
-        ds.StormerVerlet().init(terms, 0.0, 0.1, LEVEL, None)
+    ):
+        with pytest.raises(ValueError, match=message):
+            terms = ds.hamiltonian_terms(pendulum_energy, constraint=constraint)
+            ds.StormerVerlet().init(terms, 0.0, 0.1, LEVEL, None)
 
 
-@pytest.mark.parametrize(
-    "H0, message",
-    [
+def test_masses_that_are_not_constant_are_refused():
+    for H0, message in (
         (lambda t, p, q, args: jnp.sum(jnp.sqrt(1 + p**2)) + q[1], "constant masses"),
         (lambda t, p, q, args: jnp.sum(p**2) * q[1], "dH0/dq depends on p"),
-    ],
-)
-def test_masses_that_are_not_constant_are_refused(H0, message):
-    terms = ds.hamiltonian_terms(H0, constraint=rod)
-    with pytest.raises(ValueError, match=message):
-        ds.StormerVerlet().init(terms, 0.0, 0.1, LEVEL, None)
-    with pytest.raises(ValueError, match=message):
-        ds.constrained_state(terms, LEVEL)
+    ):
+        terms = ds.hamiltonian_terms(H0, constraint=rod)
+        with pytest.raises(ValueError, match=message):
+            ds.StormerVerlet().init(terms, 0.0, 0.1, LEVEL, None)
+        with pytest.raises(ValueError, match=message):
+            ds.constrained_state(terms, LEVEL)
 
 
 # Friction between coordinates, masses that differ, and a plane that is oblique to both.
@@ -431,12 +383,11 @@ def stationary(step, n, h):
 
 
 FLOWS = [ds.BAOAB(), ds.BAOAB(ds.StormerVerlet()), ds.BAOAB(ds.StormerVerlet(), 2)]
-each_flow = pytest.mark.parametrize(
-    "solver", FLOWS, ids=["flight", "1 step", "2 steps"]
+
+
+@pytest.mark.parametrize(
+    "solver", slow_except(FLOWS[:1], FLOWS), ids=["flight", "1 step", "2 steps"]
 )
-
-
-@each_flow
 def test_friction_and_noise_keep_the_maxwell_distribution_of_a_plane_exactly(solver):
     h = 0.7
 
@@ -469,49 +420,19 @@ def _errors_of_gibbs(solver, h, slow=False):
     return np.max(abs(found[3:, 3:] - exact)), np.max(abs(found[:3, 3:]))
 
 
-@pytest.mark.parametrize(
-    "solver, slow", [(ds.BAOAB(), False), (ds.BAOAB(ds.StormerVerlet()), True)]
-)
-def test_kicked_positions_in_a_harmonic_well_and_a_plane_have_the_law_of_gibbs(
-    solver, slow
-):
-    assert max(_errors_of_gibbs(solver, 0.5, slow)) < 1e-13
+def test_kicked_positions_in_a_harmonic_well_and_a_plane_have_the_law_of_gibbs():
+    assert max(_errors_of_gibbs(ds.BAOAB(), 0.5)) < 1e-13
 
 
+@pytest.mark.slow
 def test_a_flow_in_a_plane_has_an_error_of_second_order_in_the_law_of_gibbs():
     solver = ds.BAOAB(ds.StormerVerlet())
     long, mixed = _errors_of_gibbs(solver, 0.5)
     short, _ = _errors_of_gibbs(solver, 0.25)
     assert mixed < 1e-13
     assert 3.8 < long / short < 4.2
-
-
-def test_steps_with_one_rate_of_friction_are_conformally_symplectic():
-    rate, h = 0.8, 0.1
-
-    def terms(W):
-        friction = rate * jnp.broadcast_to(MASSES, (3, 2))
-        at = chain_energy, friction, TEMPERATURE, Given(W)
-        return ds.langevin_terms(*at, constraint=rods)
-
-    @jax.jit
-    @jax.vmap
-    def two_forms(key):
-        (p, q), W = chain_state(key), 0.3 * jr.normal(key, (3, 2))
-        flat, unravel = jfu.ravel_pytree((p, q))
-        step = lambda x: take_step(terms(W), 0.0, h, unravel(x), 0.5, ds.BAOAB())[0]
-        jacobian = jax.jacfwd(lambda x: jfu.ravel_pytree(step(x))[0])(flat)
-        hidden = lambda y: jax.jvp(lambda q: rods(q, None), (y[1],), (y[0] / MASSES,))
-        normals = jax.jacfwd(lambda x: jnp.concatenate(hidden(unravel(x))))(flat)
-        Z = jnp.linalg.svd(normals)[2][6:].T
-        zero, one = jnp.zeros((6, 6)), jnp.eye(6)
-        omega = jnp.block([[zero, one], [-one, zero]])
-        moved = jacobian @ Z
-        return moved.T @ omega @ moved, Z.T @ omega @ Z
-
-    after, before = two_forms(jr.split(jr.key(6), 20))
-    c = (1 - rate * h / 2) / (1 + rate * h / 2)
-    np.testing.assert_allclose(after, c * before, atol=1e-14)
+    # Beside a slow force, which kicks, it has none.
+    assert max(_errors_of_gibbs(solver, 0.5, slow=True)) < 1e-13
 
 
 FIELD = 1.2
@@ -549,40 +470,36 @@ def test_rigid_dimers_in_a_field_have_the_means_of_gibbs():
     assert np.max(np.abs(np.sum((q[:, 0] - q[:, 1]) ** 2, axis=1) - 1)) <= 1e-14
 
 
-@needs_drjit
-@pytest.mark.slow
-def test_the_fused_engine_solves_for_more_multipliers_than_are_written_out():
-    number = 7
-    line = jnp.stack([jnp.arange(number) % 2, jnp.arange(number) // 2], axis=1) * 1.0
+PATH = ds.WeakBrownianPath((2, 3), jr.key(0))
+KICKED = ds.hamiltonian_terms(
+    dimer_energy, lambda t, p, q, args: jnp.sin(q), PATH, constraint=dimer_rod
+)
+
+
+def zigzag():
+    """Seven bonds, for more multipliers than are written out."""
+    places = jnp.arange(7)
+    q = jnp.stack([places % 2, places // 2], axis=1) * 1.0
     bonds = lambda q, args: jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1)
-    lengths = bonds(line, None)
-    free = lambda t, p, q, args: jnp.sum(p**2) / 2
     terms = ds.langevin_terms(
-        free,
-        1.0,
-        TEMPERATURE,
-        ds.WeakBrownianPath((number, 2), jr.key(0)),
-        constraint=lambda q, args: bonds(q, args) - lengths,
-    )
-    at = terms, ds.BAOAB(), 0, 0.4, 0.1, (0 * line, line)
-    fused, plain = (
-        ds.ensemble(*at, key=jr.key(2), num_paths=20, engine=engine)
-        for engine in ("drjit", "jax")
-    )
-    assert fused.num_stragglers == 0
-    for a, b in zip(fused.ys, plain.ys):
-        np.testing.assert_allclose(a, b, atol=1e-12)
+        _free, 1.0, TEMPERATURE, ds.WeakBrownianPath((7, 2), jr.key(0)),
+        constraint=lambda x, args: bonds(x, args) - bonds(q, args),
+    )  # fmt: skip
+    return terms, ds.BAOAB(), (0 * q, q)
 
 
 @needs_drjit
-@pytest.mark.parametrize("solver", [ds.StormerVerlet(), *FLOWS[:2]], ids=repr)
-def test_the_fused_engine_takes_the_same_steps(solver):
-    path = ds.WeakBrownianPath((2, 3), jr.key(0))
-    terms = dimer(path)
-    if isinstance(solver, ds.StormerVerlet):
-        kicks = lambda t, p, q, args: jnp.sin(q)
-        terms = ds.hamiltonian_terms(dimer_energy, kicks, path, constraint=dimer_rod)
-    at = terms, solver, 0, 2, 0.1, DIMER
+@pytest.mark.parametrize(
+    "terms, solver, y0",
+    [
+        (dimer(PATH), FLOWS[1], DIMER),
+        pytest.param(KICKED, ds.StormerVerlet(), DIMER, marks=pytest.mark.slow),
+        pytest.param(*zigzag(), marks=pytest.mark.slow),
+    ],
+    ids=["bath", "kicks", "bonds"],
+)
+def test_the_fused_engine_takes_the_same_steps(terms, solver, y0):
+    at = terms, solver, 0, 0.4, 0.1, y0
     fused, plain = (
         ds.ensemble(*at, key=jr.key(2), num_paths=50, engine=engine)
         for engine in ("drjit", "jax")
@@ -592,100 +509,21 @@ def test_the_fused_engine_takes_the_same_steps(solver):
         np.testing.assert_allclose(a, b, atol=1e-12)
 
 
-def test_expectations_refuse_starts_off_the_constraint():
+def test_langevin_dynamics_refuse_constraints_with_other_solvers():
     terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
+    leaves = r"not keep.*`BAOAB\(StormerVerlet\(\)\)`"
+    for solver, message in (
+        (ds.BAOAB(ds.ImplicitMidpoint()), leaves),
+        (ds.BAOAB(lambda time, y, args: y), leaves),
+        (ds.LangevinMiddle(), "`StormerVerlet.*BAOAB"),
+        (ds.StormerVerlet(), "Take friction from|BAOAB"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            solver.init(terms, 0.0, 0.1, DIMER, None)
     off = DIMER[0], 1.001 * DIMER[1]
     phi = lambda t, y, args: y[1]
     with pytest.raises(ValueError, match="constrained_state"):
         ds.expectation(phi, terms, ds.BAOAB(), 0, 1, 0.1, off, key=jr.key(1))
-
-
-@pytest.mark.parametrize("flow", [ds.ImplicitMidpoint(), lambda time, y, args: y])
-def test_a_flow_that_leaves_the_constraint_is_refused(flow):
-    terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
-    with pytest.raises(ValueError, match=r"not keep.*`BAOAB\(StormerVerlet\(\)\)`"):
-        ds.BAOAB(flow).init(terms, 0.0, 0.1, DIMER, None)
-
-
-# A dipole in a field for which x = F d / T is 2.
-CHARGES = jnp.array([-2.0, 1.0, 1.0])
-ATOMS = jnp.array([16.0, 1.0, 1.0])[:, None]
-WATER = jnp.array([[0.0, 0.0, 0.0], [0.957, 0.0, 0.0], [-0.240, 0.927, 0.0]])
-DIPOLE = jnp.linalg.norm(CHARGES @ WATER)
-
-
-@needs_drjit
-@pytest.mark.slow
-def test_water_in_a_field_is_better_with_a_flow_of_its_own():
-    def energy(t, p, q, args):
-        field = 2 * TEMPERATURE / DIPOLE
-        return jnp.sum(p**2 / ATOMS) / 2 - field * (CHARGES @ q)[0]
-
-    def distances(q, args):
-        apart = lambda q: jnp.sum((q - jnp.roll(q, 1, axis=0)) ** 2, axis=1)
-        return apart(q) - apart(WATER)
-
-    def observed(t, y, args):
-        p, q = y
-        kinetic = jnp.sum(p**2 / ATOMS) / (6 * TEMPERATURE)
-        return jnp.stack([(CHARGES @ q)[0] / DIPOLE, kinetic])
-
-    friction = jnp.broadcast_to(ATOMS, (3, 3))
-    at = energy, friction, TEMPERATURE, (3, 3)
-    terms = ds.langevin_terms(*at, constraint=distances)
-    start = jnp.zeros((3, 3)), WATER
-    exact = np.array([1 / np.tanh(2.0) - 1 / 2, 1.0])
-
-    def bias(solver):
-        got = ds.expectation(
-            observed, terms, solver, 0, 12, 0.4, start, key=jr.key(1), levels=1,
-            sampling=ds.IndependentPaths(100_000), engine="drjit",
-        )  # fmt: skip
-        assert np.all(got.std_error < [0.0014, 0.0019])
-        return got.mean - exact, got.std_error
-
-    # -0.0093 and -0.010 along longer paths, with errors of 0.0005.
-    flight, error = bias(ds.BAOAB())
-    assert np.all(abs(flight - [-0.0093, -0.010]) < 4 * error)
-    # 0.0018 and -0.0005.
-    flow, error = bias(ds.BAOAB(ds.StormerVerlet()))
-    assert np.all(abs(flow - [0.0018, -0.0005]) < 4 * error)
-
-
-def test_other_solvers_for_langevin_dynamics_refuse_constraints():
-    terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
-    with pytest.raises(ValueError, match="`StormerVerlet.*BAOAB"):
-        ds.LangevinMiddle().init(terms, 0.0, 0.1, DIMER, None)
-    with pytest.raises(ValueError, match="Take friction from|BAOAB"):
-        ds.StormerVerlet().init(terms, 0.0, 0.1, DIMER, None)
-
-
-def test_a_derivative_by_the_friction_along_a_path():
-    path = ds.FixedStepBrownianPath((2, 3), jr.key(0))
-
-    def end(friction):
-        at = 3, dimer(path, friction), 0.1, DIMER, None, ds.BAOAB()
-        return jnp.sum(take_steps(*at)[0][0] ** 3)
-
-    end = jax.jit(end)
-    exact = (end(1.0 + 1e-5) - end(1.0 - 1e-5)) / 2e-5
-    np.testing.assert_allclose(jax.jit(jax.grad(end))(1.0), exact, rtol=1e-8)
-
-
-@pytest.mark.slow
-def test_a_gradient_through_a_solve():
-    def end(length, adjoint):
-        terms = ds.hamiltonian_terms(
-            pendulum_energy, constraint=lambda q, args: rod(q / args, None)
-        )
-        p, q = LEVEL
-        at = terms, 0.2, 0.1, (p, length * q), length
-        return solved(*at, adjoint=adjoint, max_steps=4)[1][0]
-
-    backward = ft.partial(end, adjoint=diffrax.RecursiveCheckpointAdjoint())
-    forward = ft.partial(end, adjoint=diffrax.ForwardMode())
-    found, exact = jax.jit(jax.grad(backward)), jax.jit(jax.jacfwd(forward))
-    np.testing.assert_allclose(found(1.2), exact(1.2), rtol=1e-13)
 
 
 def circle(centre, radius):
@@ -696,7 +534,7 @@ def circle(centre, radius):
 
 
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
-@pytest.mark.parametrize("pivot", [(0.0, 0.0), (0.0, 1.0), (0.6, 0.8), (0.0, 1000.0)])
+@pytest.mark.parametrize("pivot", [(0.6, 0.8), (0.0, 1000.0)])
 def test_no_step_depends_on_the_origin_or_the_unit_of_length(pivot, dtype):
     # With a bath, so that many come close to the origin at a low temperature. The radius
     # is a unit of length.
@@ -747,5 +585,3 @@ def test_a_start_in_single_precision_is_told_of_the_times():
     y0 = ds.constrained_state(PENDULUM, single)
     with pytest.raises(Exception, match="dtype of the times"):
         diffrax.diffeqsolve(PENDULUM, ds.StormerVerlet(), 0.0, 1.0, 0.5, y0)
-    times = jnp.array([0.0, 1.0, 0.5], jnp.float32)
-    diffrax.diffeqsolve(PENDULUM, ds.StormerVerlet(), *times, y0)

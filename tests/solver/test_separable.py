@@ -1,7 +1,5 @@
 """Families for H0 = V(p) + U(t, q) with noise in the potential."""
 
-import dataclasses
-
 import diffrax
 import equinox as eqx
 import jax
@@ -11,57 +9,17 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._tableau import Block, make_plan
+from diffrax_symplectic._tableau import make_plan
 from examples._srkw2 import PaperSRKw2
 
 from .. import paper
+from ..families import slow_except
 from ..problems import (
     Given,
     separable_H0 as H0,
     separable_noise as noise,
     separable_problem as _problem,
 )
-
-
-_gauss = 1 / 4 + np.sqrt(3) / 6
-SEPARABLE = {
-    **{f"SRKw3{v}": ds.SRKw3(v) for v in "abcdef"},
-    "SRKw4": ds.SRKw4(),
-    "SRKw4-Gauss": ds.SRKw4(a21=_gauss),
-    "SRKs2": ds.SRKs2(),
-    "SRKs3": ds.SRKs3(a=0.25),
-}
-all_solvers = pytest.mark.parametrize(
-    "solver", SEPARABLE.values(), ids=SEPARABLE.keys()
-)
-
-
-@all_solvers
-def test_conditions_hold_and_see_every_live_coefficient(solver):
-    weak_two = isinstance(solver, ds.SRKw4)
-
-    def residuals(tableau):
-        strong = ds.strong_order_residuals(tableau)
-        return np.concatenate(
-            [
-                [*ds.weak_order_residuals(tableau, 2 if weak_two else 1).values()],
-                [*strong.values()] if isinstance(solver, ds.SRKs2 | ds.SRKs3) else [],
-                np.ravel(ds.symplectic_residuals(tableau)),
-            ]
-        )
-
-    tableau = solver.tableau
-    assert np.max(np.abs(residuals(tableau))) <= 1e-15
-    for name in ("alpha", "beta", "A0", "B0", "A1"):
-        value = getattr(tableau, name)
-        for path, array in jax.tree_util.tree_leaves_with_path(value):
-            for index in np.argwhere(array != 0):
-                dead_row = name in ("A0", "B0") and tableau.alpha[index[0]] == 0
-                moved = array.copy()
-                moved[tuple(index)] += 1e-6
-                changed = moved if path == () else value | {path[0].key: moved}
-                perturbed = dataclasses.replace(tableau, **{name: changed})
-                assert dead_row or np.max(np.abs(residuals(perturbed))) >= 1e-9
 
 
 @pytest.mark.parametrize(
@@ -89,31 +47,6 @@ def test_no_step_depends_on_other_parameters_of_the_paper(make, solver):
         assert np.max(np.abs(ds.symplectic_residuals(make(x)))) <= 2e-15
 
 
-@pytest.mark.parametrize(
-    "solver, blocks",
-    [
-        # Stages: velocities, then forces, then noise.
-        (ds.SRKw3("a"), [Block(((0,),), ((1,),))]),  # the noise is read with the force
-        (
-            ds.SRKw3("b"),
-            [Block(((0,),), ((1,),)), Block((), ((2,),))],
-        ),  # drift, then kick
-        (
-            ds.SRKw3("c"),
-            [Block((), ((2,),)), Block(((0,),), ((1,),))],
-        ),  # kick, then drift
-        (ds.SRKs2(), [Block(((0,),), ((1,),))]),
-        (
-            ds.SRKs3(a=0.25),
-            [Block(((0,),), ((2,),)), Block(((1,),), ((3,),)), Block((), ((4,),))],
-        ),
-    ],
-    ids=repr,
-)
-def test_kicks_are_explicit_and_only_half_of_the_state_is_solved(solver, blocks):
-    assert list(make_plan(solver.tableau.flatten()).blocks) == blocks
-
-
 def _step(solver, W, h=0.1):
     y0, args = _problem(jr.key(0), 2, 2)
     terms = ds.hamiltonian_terms(H0, noise, Given(W))
@@ -123,7 +56,7 @@ def _step(solver, W, h=0.1):
     return y1
 
 
-@pytest.mark.parametrize("pair", ["ad", "be", "cf"])
+@pytest.mark.parametrize("pair", slow_except(["be"], ["ad", "be", "cf"]))
 def test_variants_d_e_f_are_a_b_c_at_negated_increments(pair):
     W = jnp.array([0.4, -0.3])
     plus, minus = (_step(ds.SRKw3(v), x) for v, x in zip(pair, (W, -W)))
@@ -131,35 +64,19 @@ def test_variants_d_e_f_are_a_b_c_at_negated_increments(pair):
         np.testing.assert_allclose(a, b, atol=1e-15)
 
 
-def test_srks2_is_the_midpoint_rule():
-    W = jnp.array([0.4, -0.3])
-    for a, b in zip(_step(ds.SRKs2(), W), _step(ds.ImplicitMidpoint(), W)):
-        np.testing.assert_allclose(a, b, atol=1e-15)
-
-
-def test_srkw3_c_is_a_kick_and_a_midpoint_step():
+def test_srks2_is_the_midpoint_rule_and_srkw3_c_that_after_a_kick():
     W = jnp.array([0.4, -0.3])
     y0, args = _problem(jr.key(0), 2, 2)
     terms = ds.hamiltonian_terms(H0, noise, Given(W))
     drift, diffusion = terms.terms
     kicked = y0[0] + diffusion.vf_prod(0.0, y0, args, W)[0], y0[1]
-    y1, *_ = ds.ImplicitMidpoint().step(drift, 0.0, 0.1, kicked, args, None, False)
-    for a, b in zip(_step(ds.SRKw3("c"), W), y1):
-        np.testing.assert_allclose(a, b, atol=1e-15)
-
-
-@pytest.mark.parametrize("variant", ["g", "A", "", None, 1])
-def test_unknown_variants_are_refused(variant):
-    with pytest.raises(ValueError, match="`variant` must be one of"):
-        ds.SRKw3(variant)
-
-
-@pytest.mark.parametrize("value", [1j, np.nan, np.inf])
-def test_malformed_parameters_are_refused(value):
-    with pytest.raises(ValueError, match="`a21` must be a finite real number"):
-        ds.SRKw4(a21=value)
-    with pytest.raises(ValueError, match="`a` must be a finite real number"):
-        ds.SRKs3(a=value)
+    midpoint = lambda terms, y: eqx.filter_jit(ds.ImplicitMidpoint().step)(
+        terms, 0.0, 0.1, y, args, None, False
+    )[0]
+    np.testing.assert_allclose(_step(ds.SRKs2(), W), midpoint(terms, y0), atol=1e-15)
+    np.testing.assert_allclose(
+        _step(ds.SRKw3("c"), W), midpoint(drift, kicked), atol=1e-15
+    )
 
 
 def test_unused_halves_of_gradients_are_not_computed():
@@ -184,3 +101,27 @@ def test_unused_halves_of_gradients_are_not_computed():
     for solver, kicks in ((ds.StormerVerlet(), 1), (ds.SRKw3("b"), 1), (ds.SRKw3(), 3)):
         assert count(step(solver), "cosine") == kicks
     assert count(step(ds.SRKs3()), "cosine") < count(step(ds.SRKs2()), "cosine")
+
+
+def test_stormer_verlet_drifts_half_a_step_kicks_and_drifts_again():
+    y0, args = _problem(jr.key(0), 2, 2)
+    t0, h, W = 0.3, 0.1, jnp.array([0.4, -0.3])
+    terms = ds.hamiltonian_terms(H0, noise, Given(W))
+    drift, diffusion = terms.terms
+    p, q = y0
+    q = q + h / 2 * drift.vf(t0, (p, q), args)[1]
+    kick = h * drift.vf(t0 + h / 2, (p, q), args)[0]
+    p = p + kick + diffusion.vf_prod(t0 + h / 2, (p, q), args, W)[0]
+    q = q + h / 2 * drift.vf(t0, (p, q), args)[1]
+    y1, *_ = ds.StormerVerlet().step(terms, t0, t0 + h, y0, args, None, False)
+    np.testing.assert_allclose(y1, (p, q), rtol=1e-15)
+
+
+def test_explicit_methods_have_no_equation_to_solve():
+    y0, args = _problem(jr.key(0), 2, 2)
+    terms = ds.hamiltonian_terms(H0, noise, ds.PlateauVerlet().path((2,), jr.key(0)))
+    for solver in (ds.PlateauVerlet(), ds.StormerVerlet()):
+        assert not isinstance(solver, diffrax.AbstractImplicitSolver)
+        step = lambda y0, s=solver: s.step(terms, 0.0, 0.1, y0, args, None, False)[0]
+        text = str(jax.make_jaxpr(step)(y0))
+        assert "root_find" not in text and "triangular_solve" not in text

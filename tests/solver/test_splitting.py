@@ -14,7 +14,7 @@ from .test_langevin import MASS, ORIGIN, stationary_moments, STIFFNESS, T
 
 
 KEY = jr.key(3)
-HALF_KICK, HALF_BATH, HALF_FLIGHT = ds.Kick(1 / 2), ds.Bath(1 / 2), ds.Flight(1 / 2)
+HALF_KICK, HALF_FLIGHT = ds.Kick(1 / 2), ds.Flight(1 / 2)
 BAOAB = ds.Splitting([HALF_KICK, HALF_FLIGHT, ds.Bath(1), HALF_FLIGHT, HALF_KICK])
 ABOBA = ds.Splitting([HALF_FLIGHT, HALF_KICK, ds.Bath(1), HALF_KICK, HALF_FLIGHT])
 MIDDLE = ds.Splitting([ds.Kick(1), HALF_FLIGHT, ds.Bath(1), HALF_FLIGHT])
@@ -70,13 +70,10 @@ def test_the_solvers_with_names_are_their_pieces(pieces, named, options):
 def test_a_rod_is_kept_by_any_order_of_the_pieces():
     rod = lambda q, args: jnp.sum(q**2, keepdims=True) - 1
     y0 = jnp.zeros(3), jnp.array([0.6, 0.0, -0.8])
-    same = []
-    for solver in (BAOAB, ds.BAOAB(), ABOBA, OBABO):
+    for solver in (ABOBA, OBABO):
         p, q = _solve(solver, _terms(solver, constraint=rod), y0)
         np.testing.assert_allclose(q[-1] @ q[-1], 1, rtol=1e-14)
         np.testing.assert_allclose(p[-1] @ q[-1], 0, atol=1e-14)
-        same.append(p)
-    np.testing.assert_array_equal(same[0], same[1])
 
 
 @pytest.mark.parametrize("h", [0.2, 1.0])
@@ -134,32 +131,6 @@ def test_forces_at_the_end_of_a_step_are_those_at_the_start_of_the_next_one():
 
         compiled = jax.jit(step).lower(START, state).compile().as_text()
         assert compiled.count(" cosine(") == 1, solver
-
-
-def test_expectations_and_derivatives_of_a_splitting_of_ones_own():
-    well = lambda t, p, q, k: p**2 / 2 + k * q**2 / 2
-
-    def mean(k):
-        terms = ds.langevin_terms(well, 1.0, 0.6, OBABO.path((), KEY))
-        y0 = jnp.array(0.2), jnp.array(0.5)
-        _, q = _solve(OBABO, terms, y0, args=k)
-        return q[0] ** 2
-
-    k, change = 1.3, 1e-5
-    difference = (mean(k + change) - mean(k - change)) / (2 * change)
-    np.testing.assert_allclose(jax.grad(mean)(k), difference, rtol=1e-8)
-    square = lambda t, y, args: y[1] ** 2
-    terms = ds.langevin_terms(well, 1.0, 0.6, ())
-    y0 = jnp.array(0.0), jnp.array(1.0)
-    sampling = ds.IndependentPaths(4096)
-    got, of_baoab = (
-        ds.expectation(
-            square, terms, solver, 0, 2, 0.2, y0, 1.3, key=KEY, sampling=sampling
-        )
-        for solver in (OBABO, ds.BAOAB())
-    )
-    # Of independent samples.
-    assert abs(got.mean - of_baoab.mean) < 4 * np.hypot(got.error, of_baoab.error)
 
 
 def test_pieces_that_are_no_splitting_are_refused():

@@ -72,12 +72,6 @@ def test_steps_that_single_precision_does_not_resolve_fail(solver):
     np.testing.assert_array_equal(num_steps[:3], 1)
 
 
-def test_double_precision_resolves_steps_that_single_precision_does_not():
-    solver = ds.StormerVerlet()
-    sol = _solve(solver, solver.path((), jr.key(0)), 1e6, 1e6 + 0.1, 0.01)
-    assert sol.stats["num_steps"] == 10
-
-
 def test_the_error_comes_where_the_times_become_too_coarse():
     solver = ds.StormerVerlet()
     path = _single(solver)
@@ -87,28 +81,19 @@ def test_the_error_comes_where_the_times_become_too_coarse():
     # 100 roundings are 100 eps t: steps of 0.01 are too short beyond 839, and those that
     # are rounded down a little before.
     saveat = diffrax.SaveAt(t1=True)
-    run = lambda t1: _solve(
-        solver, path, 0.0, t1, 0.01, jnp.float32, throw=False, saveat=saveat
-    )
+    options = dict(throw=False, saveat=saveat)
+
+    @jax.jit
+    def run(t1):
+        return _solve(solver, path, 0.0, t1, 0.01, jnp.float32, **options)
+
     assert run(800.0).result == diffrax.RESULTS.successful
     late = run(1000.0)
     assert late.result == TOO_SHORT
     assert 830 < late.stats["num_steps"] * 0.01 < 839
-
-
-def test_other_paths_of_a_batch_go_on():
-    solver = ds.StormerVerlet()
-    path = _single(solver)
-
-    @jax.vmap
-    def run(t0):
-        sol = _solve(solver, path, t0, t0 + 1, 0.01, jnp.float32, throw=False)
-        return sol.result == diffrax.RESULTS.successful, sol.ys[0][0]
-
-    good, p = jax.jit(run)(jnp.array([0.0, 1e6], jnp.float32))
-    np.testing.assert_array_equal(good, [True, False])
-    alone = _solve(solver, path, 0.0, 1.0, 0.01, jnp.float32).ys[0][0]
-    np.testing.assert_allclose(p[0], alone, rtol=1e-5)
+    # Double precision resolves them.
+    double = _solve(solver, solver.path((), jr.key(0)), 1e6, 1e6 + 0.1, 0.01)
+    assert double.stats["num_steps"] == 10
 
 
 class Recorded(diffrax.AbstractBrownianPath):
@@ -205,11 +190,10 @@ def test_suggestions_tell_of_a_path_of_diffrax_that_repeats_its_noise():
     assert distinct(unsafe) < 5_000 and distinct(ours) == 10_000
 
 
-@pytest.mark.parametrize(
-    "solver", [ds.ImplicitMidpoint(), ds.NinomiyaVictoir()], ids=repr
-)
 @pytest.mark.parametrize("operator", [True, False])
-def test_noises_that_do_not_fit_their_control_term_are_refused(solver, operator):
+def test_noises_that_do_not_fit_their_control_term_are_refused(operator):
+    solver = ds.ImplicitMidpoint() if operator else ds.NinomiyaVictoir()
+
     def field(t, y, args):
         struct = jax.ShapeDtypeStruct((2,), jnp.float64)
         kick = lambda w: 0.1 * w

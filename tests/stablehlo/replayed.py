@@ -50,7 +50,7 @@ def _replayed_lanes(
 ) -> tuple[list[np.ndarray], np.ndarray]:
     replay = Replay(program)
     tensors = [tensor(x, of.kind) for x, of in zip(args, replay.arguments)]
-    results, errors = replay(*tensors)
+    results, errors = replay(*tensors, constants=replay.constants())
     drjit().eval(errors, *[result.entries for result in results])
     number = len(args[0])
     arrays = [

@@ -7,6 +7,7 @@ import pathlib
 import re
 
 import diffrax
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -17,67 +18,62 @@ from diffrax_symplectic._tableau import Block, make_plan
 from diffrax_symplectic._tableau.tableau import NOISE_VARIABLES
 from examples._srkw2 import PaperSRKw2, srkw2_tableau
 
-
-TABLEAUS = {
-    "ImplicitMidpoint": ds.ImplicitMidpoint().tableau,
-    "SRKw2": ds.SRKw2().tableau,
-    "StrangGauss": ds.StrangGauss().tableau,
-    **{f"SRKs1({a})": ds.SRKs1(a=a).tableau for a in (-0.3, 0.0, 0.25, 0.4, 0.5)},
-    **{f"SRKw1({b})": ds.SRKw1(b=b).tableau for b in (-0.3, 0.0, 0.5, 0.7, 1.0)},
-}
-all_tableaus = pytest.mark.parametrize(
-    "tableau", TABLEAUS.values(), ids=TABLEAUS.keys()
-)
+from ..solver.test_every_solver import TABLE
 
 
-@all_tableaus
-def test_tableau_is_symplectic(tableau):
-    assert np.max(np.abs(ds.symplectic_residuals(tableau))) <= 1e-15
+SOLVERS = [
+    *(solver for solver in TABLE if hasattr(solver, "tableau")),
+    *(ds.SRKs1(a=a) for a in (-0.3, 0.0, 0.4, 0.5)),
+    *(ds.SRKw1(b=b) for b in (-0.3, 0.0, 0.7, 1.0)),
+]
+each_solver = pytest.mark.parametrize("solver", SOLVERS, ids=repr)
 
 
-@all_tableaus
-def test_tableau_has_weak_order_one(tableau):
-    residuals = ds.weak_order_residuals(tableau, 1)
-    assert max(map(abs, residuals.values())) <= 1e-15
+def _residuals(solver, tableau=None, order=None):
+    """Those of the conditions for the claims of the solver."""
+    tableau = solver.tableau if tableau is None else tableau
+    order = min(solver.record.order("weak", True), 2) if order is None else order
+    found = [*ds.weak_order_residuals(tableau, order).values()]
+    if solver.record.strong is not None:
+        found += ds.strong_order_residuals(tableau).values()
+    found.append(np.max(np.abs(ds.symplectic_residuals(tableau))))
+    return np.abs(found)
 
 
-@pytest.mark.parametrize("name", ["SRKw2", "StrangGauss"])
-def test_all_17_conditions_for_weak_order_two_are_satisfied(name):
-    residuals = ds.weak_order_residuals(TABLEAUS[name], 2)
-    assert len(residuals) == 17
-    assert max(map(abs, residuals.values())) <= 1e-15
+@each_solver
+def test_conditions_hold_and_see_every_live_coefficient(solver):
+    assert np.max(_residuals(solver)) <= 1e-14
+    plan = make_plan(solver.tableau.flatten())
+    for name, value in vars(solver.tableau).items():
+        if name in ("noise", "constant"):
+            continue
+        for path, array in jax.tree_util.tree_leaves_with_path(value):
+            for index in np.ndindex(array.shape):
+                if array[index] == 0 and solver.structure in ("constant", "additive"):
+                    # Some of these enter conditions by their squares alone.
+                    continue
+                moved = array.copy()
+                moved[index] += 1e-6
+                changed = moved if path == () else value | {path[0].key: moved}
+                tableau = dataclasses.replace(solver.tableau, **{name: changed})
+                # The coefficients of a stage that nothing reads are free.
+                other = make_plan(tableau.flatten()).tableau
+                dead = other.stages == plan.tableau.stages and all(
+                    np.array_equal(getattr(other, x), getattr(plan.tableau, x))
+                    for x in ("matrix", "weights")
+                )
+                assert dead or np.max(_residuals(solver, tableau)) >= 1e-9, name
 
 
-@pytest.mark.parametrize(
-    "name", [n for n in TABLEAUS if n not in ("SRKw2", "StrangGauss")]
-)
-def test_other_tableaus_do_not_have_weak_order_two(name):
-    residuals = ds.weak_order_residuals(TABLEAUS[name], 2)
-    assert max(map(abs, residuals.values())) > 1e-2
-
-
-@pytest.mark.parametrize("a", [0.0, 0.25, 0.5])
-def test_strong_tableaus_have_strong_order(a):
-    for tableau in (ds.ImplicitMidpoint().tableau, ds.SRKs1(a=a).tableau):
-        residuals = ds.strong_order_residuals(tableau)
-        assert max(map(abs, residuals.values())) <= 1e-15
-
-
-@all_tableaus
-@pytest.mark.parametrize("field", ["alpha", "beta", "A0", "B0", "A1", "B1"])
-def test_every_perturbed_live_coefficient_is_caught(tableau, field):
-    coefficients = getattr(tableau, field)
-    for index in np.ndindex(coefficients.shape):
-        wrong = coefficients.copy()
-        wrong[index] += 1e-6
-        perturbed = dataclasses.replace(tableau, **{field: wrong})
-        residuals = [*ds.weak_order_residuals(perturbed, 1).values()]
-        residuals.append(np.max(np.abs(ds.symplectic_residuals(perturbed))))
-        # The coefficients of a stage of weight 0 that nothing reads are free.
-        weights = dict(A0="alpha", B0="alpha", A1="beta", B1="beta")
-        dead = field in weights and getattr(tableau, weights[field])[index[0]] == 0
-        caught = np.max(np.abs(residuals)) > 1e-8
-        assert caught or dead
+def test_weak_order_two_has_17_conditions_which_other_tableaus_do_not_meet():
+    assert len(ds.weak_order_residuals(ds.SRKw2().tableau, 2)) == 17
+    for solver in SOLVERS:
+        if solver.record.order("weak", True) == 1:
+            assert np.max(_residuals(solver, order=2)) > 1e-2
+    # Those of `PlateauGauss` are met by its brackets.
+    tableau = dataclasses.replace(ds.PlateauGauss().tableau, noise=("W",))
+    without = ds.weak_order_residuals(tableau, 2)
+    assert sum(abs(r) > 0.05 for r in without.values()) == 5
 
 
 def test_every_member_of_srkw2_satisfies_all_conditions():
@@ -91,26 +87,53 @@ def test_every_member_of_srkw2_satisfies_all_conditions():
     assert np.array_equal(solver.matrix, member.matrix)
 
 
-@pytest.mark.parametrize(
-    "solver, blocks",
-    [
-        (ds.ImplicitMidpoint(), [1]),
-        (ds.SRKs1(a=0.0), [1]),
-        (ds.SRKs1(a=0.5), [1]),
-        (ds.SRKs1(a=0.25), [1, 1]),
-        (ds.SRKw1(b=0.5), [1]),
-        (ds.SRKw1(b=0.0), [1, 1]),
-        (ds.SRKw1(b=1.0), [1, 1]),
-        (ds.SRKw1(b=0.2), [2]),
-        (ds.SRKw2(), [5, 1]),
-        (PaperSRKw2(), [6]),
-        (ds.StrangGauss(), [1, 2, 1]),
-    ],
-)
-def test_only_live_distinct_stages_are_solved(solver, blocks):
-    plan = make_plan(solver.tableau.flatten())
-    assert [sum(map(len, b.unknown)) for b in plan.blocks] == blocks
-    assert all(block.explicit == () for block in plan.blocks)
+# The numbers of unknown vectors in each block.
+UNKNOWN = [
+    (ds.ImplicitMidpoint(), [1]),
+    (ds.SRKs1(a=0.0), [1]),
+    (ds.SRKs1(a=0.5), [1]),
+    (ds.SRKs1(a=0.25), [1, 1]),
+    (ds.SRKw1(b=0.5), [1]),
+    (ds.SRKw1(b=1.0), [1, 1]),
+    (ds.SRKw1(b=0.2), [2]),
+    (ds.SRKw2(), [5, 1]),
+    (PaperSRKw2(), [6]),
+    (ds.StrangGauss(), [1, 2, 1]),
+    (ds.SRKs2(), [1]),
+    # The noise is read with the force; drift, then kick; kick, then drift.
+    (ds.SRKw3("a"), [1]),
+    (ds.SRKw3("b"), [1, 0]),
+    (ds.SRKw3("c"), [0, 1]),
+    (ds.SRKs3(a=0.25), [1, 1, 0]),
+    (ds.StormerVerlet(), [0, 0, 0]),
+    (ds.PlateauVerlet(), [0] * 12),
+    (ds.SRKw5(), [0, 0, 1]),
+    (ds.SRKs4(), [0, 0, 0, 0, 1, 1]),
+]
+
+
+def test_only_live_distinct_stages_are_solved():
+    for solver, numbers in UNKNOWN:
+        blocks = make_plan(solver.tableau.flatten()).blocks
+        assert [sum(map(len, b.unknown)) for b in blocks] == numbers, solver
+
+
+def test_parameters_that_are_none_are_refused():
+    for make, name in (
+        *((ds.SRKs1, "a"), (ds.SRKw1, "b"), (ds.SRKw4, "a21"), (ds.SRKs3, "a")),
+        *((ds.SRKs4, name) for name in ("beta1", "beta2", "b")),
+    ):
+        for value in (1j, np.nan, np.inf, "x"):
+            with pytest.raises(ValueError, match=f"`{name}` must be a finite real num"):
+                make(**{name: value})
+    for variant in ("g", "A", "", None, 1):
+        with pytest.raises(ValueError, match="`variant` must be one of"):
+            ds.SRKw3(variant)
+    with pytest.raises(ValueError, match="`beta2` must not be 0"):
+        ds.SRKs4(beta2=0)
+    for sign in (0, 2, True, 0.5, "-"):
+        with pytest.raises(ValueError, match="`sign` must be 1 or -1"):
+            ds.SRKs4(sign=sign)
 
 
 def test_explicit_stages_never_reach_the_root_finder():
@@ -122,25 +145,14 @@ def test_explicit_stages_never_reach_the_root_finder():
     assert np.max(np.abs(ds.symplectic_residuals(heun))) > 0.1
 
 
-@pytest.mark.parametrize(
-    "change, message",
-    [
+def test_malformed_tableaus_are_refused():
+    for change, message in (
         (dict(A0=np.ones((2, 2))), r"`A0` must have shape \(1, 1\)"),
         (dict(beta=[np.nan]), "`beta` must be finite"),
         (dict(alpha=[1j]), "`alpha` must be real"),
-    ],
-)
-def test_malformed_tableaus_are_refused(change, message):
-    with pytest.raises(ValueError, match=message):
-        dataclasses.replace(ds.ImplicitMidpoint().tableau, **change)
-
-
-@pytest.mark.parametrize("value", [1j, np.nan, np.inf, "a", None])
-def test_malformed_parameters_are_refused(value):
-    with pytest.raises(ValueError, match="`a` must be a finite real number"):
-        ds.SRKs1(a=value)
-    with pytest.raises(ValueError, match="`b` must be a finite real number"):
-        ds.SRKw1(b=value)
+    ):
+        with pytest.raises(ValueError, match=message):
+            dataclasses.replace(ds.ImplicitMidpoint().tableau, **change)
 
 
 def test_weak_order_residuals_know_orders_one_and_two():
@@ -188,18 +200,16 @@ def test_noise_of_a_tableau_is_a_tuple_of_names():
     assert set(NOISE_VARIABLES) == set(VARIABLES)
 
 
-@pytest.mark.parametrize(
-    "noise", [("W", "H"), ("H",), ("A",), ("W", "W"), ("two_point",)], ids=repr
-)
-def test_general_conditions_are_refused_unless_the_increment_drives_the_noise(noise):
-    tableau = dataclasses.replace(ds.SRKw2().tableau, noise=noise)
-    for residuals in (
-        ds.strong_order_residuals,
-        lambda x: ds.weak_order_residuals(x, 1),
-        lambda x: ds.weak_order_residuals(x, 2),
-    ):
-        with pytest.raises(ValueError, match=r'variable "W", .*weak_order_defect'):
-            residuals(tableau)
+def test_general_conditions_are_refused_unless_the_increment_drives_the_noise():
+    for noise in (("W", "H"), ("H",), ("A",), ("W", "W"), ("two_point",)):
+        tableau = dataclasses.replace(ds.SRKw2().tableau, noise=noise)
+        for residuals in (
+            ds.strong_order_residuals,
+            lambda x: ds.weak_order_residuals(x, 1),
+            lambda x: ds.weak_order_residuals(x, 2),
+        ):
+            with pytest.raises(ValueError, match=r'variable "W", .*weak_order_defect'):
+                residuals(tableau)
 
 
 def test_tableaus_know_nothing_of_jax():

@@ -1,6 +1,7 @@
 """Spins and rigid bodies: the pair (p, q) stands for s, and each step is a Poisson map."""
 
 import functools as ft
+from collections.abc import Callable
 
 import diffrax
 import equinox as eqx
@@ -12,7 +13,8 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from ..problems import Given, local_weak_orders, rigid_body_terms, weak_path
+from ..picard import by_picard
+from ..problems import Given, rigid_body_terms, slope, weak_path
 
 
 def H0(t, s, args):
@@ -95,172 +97,68 @@ def test_spinors_of_spins_give_them_back_with_their_derivatives_everywhere(dtype
     assert np.max(sizes) <= 32 * eps
 
 
-@ft.cache
-def _thousand_systems():
-    """States, parameters, step sizes and random variables."""
-
-    def draw(key):
-        k_problem, k_h, k_W, k_A, k_coin = jr.split(key, 5)
-        s0, args = _problem(k_problem, 2, 3, float)
+@pytest.mark.slow
+def test_step_is_a_poisson_map_for_a_thousand_random_systems():
+    # A symplectic step for (p, q) is a Poisson map for s, whatever the solver, and every
+    # solver has a test that its steps are symplectic.
+    @jax.jit
+    @jax.vmap
+    def defect(key):
+        k_problem, k_h, k_W = jr.split(key, 3)
+        s0, args = _problem(k_problem, 2, 3)
         # Uniform in the logarithm over [1e-3, 0.2].
         h = jnp.exp(jr.uniform(k_h, (), float, jnp.log(1e-3), jnp.log(0.2)))
         W = jnp.sqrt(h) * jnp.clip(jr.normal(k_W, (3,)), -2.5, 2.5)
-        A = h / 2 * jr.normal(k_A, (3, 3))
-        return s0, args, h, W, A - A.T, jr.rademacher(k_coin, (3,), float)
+        solver = by_picard(ds.ImplicitMidpoint())
+        at = ds.spin_terms(H0, noise, Given(W)), solver, 0.0, h
+        return ds.poisson_defect(*at, ds.to_spinors(s0), args)
 
-    return jax.jit(jax.vmap(draw))(jr.split(jr.key(0), 1000))
-
-
-# A symplectic step for (p, q) is a Poisson map for s, whatever the solver, and every solver
-# has a test that its steps are symplectic. So here is one for each kind of step.
-@pytest.mark.parametrize(
-    "solver, dtype, bound",
-    [
-        (ds.ImplicitMidpoint(), jnp.float64, 1e-13),
-        pytest.param(ds.ImplicitMidpoint(), jnp.float32, 5e-6, marks=pytest.mark.slow),
-        pytest.param(ds.NinomiyaVictoir(), jnp.float64, 1e-13, marks=pytest.mark.slow),
-    ],
-    ids=["ImplicitMidpoint", "float32", "NinomiyaVictoir"],
-)
-def test_step_is_a_poisson_map_for_a_thousand_random_systems(solver, dtype, bound):
-    def defect(s0, args, h, W, A, coin):
-        terms = ds.spin_terms(H0, noise, Given(W, A=A, two_point=coin))
-        y0 = ds.to_spinors(s0)
-        return ds.poisson_defect(terms, solver, jnp.zeros_like(h), h, y0, args)
-
-    systems = jax.tree.map(dtype, _thousand_systems())
-    defects = jax.jit(jax.vmap(defect))(*systems)
-    assert defects.dtype == dtype
-    assert jnp.max(defects) <= bound
+    assert jnp.max(defect(jr.split(jr.key(0), 1000))) <= 1e-13
 
 
-@pytest.mark.parametrize("solver", [ds.ImplicitMidpoint(), diffrax.Heun()])
-def test_poisson_defect_sees_a_method_for_the_spins_themselves(solver):
+def test_poisson_defect_sees_a_method_for_the_spins_themselves():
     # The midpoint rule keeps |s| there, but not the bracket.
     s0 = jnp.array([0.6, 0.0, 0.8])
     terms = rigid_body_terms(Given(jnp.array(0.1)))
-    defect = ds.poisson_defect(terms, solver, 0.0, 0.2, s0)
+    defect = ds.poisson_defect(terms, ds.ImplicitMidpoint(), 0.0, 0.2, s0)
     assert 1e-4 < defect < 1e-2
 
 
-def test_one_step_in_a_constant_field_is_the_rotation_of_the_cayley_map():
-    # In a field B the lift is linear with frequency |B| / 2, so that a midpoint step of
-    # it turns s about -B by four times the angle arctan(h |B| / 4).
-    B, s0, h = jnp.array([0.3, -0.5, 0.8]), jnp.array([0.2, 0.9, -0.4]), 0.5
-    field = lambda t, s, args: B @ s
-    terms = ds.spin_terms(lambda t, s, args: 0.0, field, Given(jnp.array([h])))
-    y0 = ds.to_spinors(s0)
-    y1, *_ = ds.ImplicitMidpoint().step(terms, 0.0, h, y0, None, None, False)
-    length = jnp.linalg.norm(B)
-    axis, angle = -B / length, 4 * jnp.arctan(h * length / 4)
-    expected = (
-        jnp.cos(angle) * s0
-        + jnp.sin(angle) * jnp.cross(axis, s0)
-        + (1 - jnp.cos(angle)) * (axis @ s0) * axis
-    )
-    np.testing.assert_allclose(ds.from_spinors(y1), expected, atol=1e-15)
-
-
-@pytest.mark.slow
-def test_ninomiya_victoir_is_weak_order_two_for_noises_that_do_not_commute():
-    terms = ds.spin_terms(H0, noise, weak_path(2, two_point=True))
-    s0, args = jax.vmap(lambda key: _problem(key, 1, 2))(jr.split(jr.key(2), 2))
-
-    def fn(t, y, args):
-        s = ds.from_spinors(y)[0]
-        return jnp.stack([s[2], s[0] * s[1], jnp.exp(s[1] / 2)])
-
-    hs = np.array([0.02, 0.01, 0.005, 0.0025])
-    y0 = ds.to_spinors(s0)
-    solver = ds.NinomiyaVictoir()
-    slopes = local_weak_orders(terms, solver, y0, args, hs, order=2, fn=fn)
-    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
-
-
-@pytest.mark.slow
 def test_noises_of_spins_may_be_indexed():
     s0, args = _problem(jr.key(0), 2, 3)
-    y0 = ds.to_spinors(s0)
-    path = weak_path(3, two_point=True)
     indexed = ds.IndexedNoise(lambda k, t, s, args: noise(t, s, args)[k], 3)
-    solver = ds.NinomiyaVictoir()
-
-    def end(y0, args, fields):
-        terms = ds.spin_terms(H0, fields, path)
-        y1, *_ = solver.step(terms, 0.0, 0.1, y0, args, None, False)
-        return ds.from_spinors(y1)
-
-    ends = jax.jit(lambda *x: [end(*x, fields) for fields in (noise, indexed)])(
-        y0, args
+    all_at_once, one_by_one = (
+        ds.spin_terms(H0, fields, weak_path(3))
+        .terms[1]
+        .vf(0.4, ds.to_spinors(s0), args)
+        for fields in (noise, indexed)
     )
-    np.testing.assert_allclose(*ends, atol=1e-15)
+    for x, y in zip(one_by_one, all_at_once):
+        np.testing.assert_allclose(x, y, atol=1e-15)
 
 
-def _end(y0, args, solver=ds.ImplicitMidpoint()):  # noqa: B008
-    """Of a chain of spins with a field along each axis of each spin."""
-
-    def H0(t, s, args):
-        return -jnp.sum(s[1:] * s[:-1])
-
-    dtype = y0[0].dtype
+def test_a_step_keeps_lengths_in_single_precision_and_does_not_see_the_phase():
+    dtype, eps = np.float32, np.finfo(np.float32).eps
+    H0 = lambda t, s, args: -jnp.sum(s[1:] * s[:-1])
     path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((4, 3), dtype), jr.key(0))
-    terms = ds.spin_terms(H0, lambda t, s, args: args * s, path)
-    times = jnp.array([0, 1, 0.125], dtype)
-    sol = diffrax.diffeqsolve(terms, solver, *times, y0, args, throw=False)
-    return ds.from_spinors(sol.ys)[0], sol.result == diffrax.RESULTS.successful
+    terms = ds.spin_terms(H0, lambda t, s, args: 0.3 * s, path)
 
+    @jax.jit
+    def step(y0):
+        at = terms, jnp.zeros((), dtype), jnp.ones((), dtype), y0, None, None, False
+        return ds.from_spinors(ds.ImplicitMidpoint().step(*at)[0])
 
-@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
-@pytest.mark.slow
-def test_a_batch_of_chains_keeps_lengths_and_does_not_see_the_phase(dtype):
-    eps = jnp.finfo(dtype).eps
-    s0 = jax.vmap(lambda key: _problem(key, 4, 1, dtype)[0])(jr.split(jr.key(0), 3))
-    p, q = map(np.asarray, jax.jit(ds.to_spinors)(s0))
+    s0 = _problem(jr.key(0), 4, 1, jnp.float32)[0]
+    p, q = map(np.asarray, ds.to_spinors(s0))
     # Another phase for each spin.
-    phase = 2 * np.pi * np.random.default_rng(1).random((3, 4, 1))
+    phase = 2 * np.pi * np.random.default_rng(1).random((4, 1))
     c, s = np.cos(phase).astype(dtype), np.sin(phase).astype(dtype)
-    turned = c * p + s * q, c * q - s * p
-    # The second path of the batch has no finite numbers.
-    args = jnp.array([0.3, jnp.nan, 0.5], dtype)
-    end = jax.jit(jax.vmap(_end))
-    s1, success = map(np.asarray, end((p, q), args))
-    np.testing.assert_array_equal(success, [True, False, True])
-    again = np.asarray(end(turned, args)[0])[success]
-    s1, s0 = s1[success], np.asarray(s0)[success]
+    s1, again = step((p, q)), step((c * p + s * q, c * q - s * p))
     assert s1.dtype == dtype
     assert np.max(np.linalg.norm(s1 - s0, axis=-1)) > 0.1
     lengths = [np.linalg.norm(s, axis=-1) for s in (s0, s1)]
-    np.testing.assert_allclose(*lengths, rtol=64 * eps)
-    np.testing.assert_allclose(again, s1, atol=256 * eps)
-
-
-@pytest.mark.slow
-def test_gradients_go_through_a_solve_from_the_poles():
-    s0 = np.concatenate([POLES, EQUATOR[:2]])
-    weights, direction = np.random.default_rng(1).normal(size=(2, 4, 3))
-    solver = ds.ImplicitMidpoint()
-    value = lambda s, args: jnp.sum(weights * _end(ds.to_spinors(s), args, solver)[0])
-    # One program for the gradient and for the values that are compared to it.
-    both = jax.jit(jax.value_and_grad(value, argnums=(0, 1)))
-    _, (by_s, by_args) = both(s0, 0.3)
-    k = 1e-5
-    along = lambda ds, dargs: [both(s0 + x * ds, 0.3 + x * dargs)[0] for x in (k, -k)]
-    slopes = [-np.diff(along(*d))[0] / (2 * k) for d in ((direction, 0), (0, 1))]
-    got = [np.sum(by_s * direction), by_args]
-    np.testing.assert_allclose(got, slopes, rtol=1e-8)
-
-
-@pytest.mark.parametrize(
-    "solver",
-    [ds.SRKs2(), ds.SRKs4(), ds.SRKw3(), ds.SRKw5(), ds.StormerVerlet(),
-     ds.PlateauVerlet(), ds.AdditiveGauss()],
-    ids=repr,
-)  # fmt: skip
-def test_solvers_that_need_more_structure_refuse_spins(solver):
-    s0, args = _problem(jr.key(0), 1, 1)
-    terms = ds.spin_terms(H0, noise, weak_path(1))
-    with pytest.raises(ValueError, match="use a solver for general systems"):
-        solver.init(terms, 0.0, 0.1, ds.to_spinors(s0), args)
+    np.testing.assert_allclose(*lengths, rtol=16 * eps)
+    np.testing.assert_allclose(again, s1, atol=32 * eps)
 
 
 def test_what_are_no_spins_is_refused():
@@ -319,3 +217,168 @@ def test_a_field_on_each_of_many_spins_costs_one_reverse_pass():
     shapes = eqx.filter_make_jaxpr(evaluate)(y0, increment)[0].jaxpr.eqns
     largest = max(v.aval.size for eqn in shapes for v in eqn.outvars)
     assert largest <= 4 * n
+
+
+def test_with_damping_solutions_push_forward_to_the_landau_lifshitz_equation():
+    s, args = _problem(jr.key(0), 40, 3)
+    alpha = jr.uniform(jr.key(1), (40,))
+    y = ds.to_spinors(s)
+    gradient = jax.grad(lambda s: H0(0.4, s, args))(s)
+    for damping in (alpha, 0.3, 0.0):
+        drift, _ = ds.spin_terms(H0, noise, weak_path(3), damping).terms
+        _, velocity = jax.jvp(ds.from_spinors, (y,), (drift.vf(0.4, y, args),))
+        turn = jnp.cross(s, gradient)
+        rate = jnp.reshape(jnp.broadcast_to(damping, 40), (40, 1))
+        expected = turn + rate * jnp.cross(s, turn)
+        np.testing.assert_allclose(velocity, expected, atol=1e-14)
+        # The energy falls at this rate.
+        power = jnp.sum(gradient * velocity)
+        np.testing.assert_allclose(
+            power, -jnp.sum(rate * turn**2), rtol=1e-12, atol=1e-15
+        )
+
+
+def test_dampings_fit_lattices_of_spins_and_take_their_precision():
+    s = _problem(jr.key(0), 6, 3, jnp.float32)[0]
+    alpha = np.linspace(0.0, 1.0, 6)
+    args = _problem(jr.key(0), 6, 3, jnp.float32)[1]
+
+    def velocity(*lattice):
+        y = ds.to_spinors(s.reshape(*lattice, 3))
+        terms = ds.spin_terms(H0, noise, weak_path(3), alpha.reshape(lattice))
+        return terms.terms[0].vf(jnp.float32(0.4), y, args)
+
+    for flat, shaped in zip(velocity(6), velocity(2, 3)):
+        assert shaped.dtype == jnp.float32
+        np.testing.assert_array_equal(shaped.reshape(6, 2), flat)
+
+
+# The last makes vector fields of brackets.
+@pytest.mark.parametrize(
+    "solver",
+    [
+        ds.ImplicitMidpoint(),
+        pytest.param(ds.PlateauGauss(), marks=pytest.mark.slow),
+    ],
+    ids=repr,
+)
+def test_with_damping_length_is_kept_for_a_thousand_random_systems(solver):
+    def change(key):
+        k_problem, k_h, k_W, k_alpha = jr.split(key, 4)
+        s0, args = _problem(k_problem, 2, 3)
+        h = jnp.exp(jr.uniform(k_h, (), float, jnp.log(1e-3), jnp.log(0.2)))
+        W = jnp.sqrt(h) * jnp.clip(jr.normal(k_W, (3,)), -2.5, 2.5)
+        given, alpha = Given(W, H=W[::-1] / 4), jr.uniform(k_alpha, (2,))
+        terms = ds.spin_terms(H0, noise, given, damping=alpha)
+        y0 = ds.to_spinors(s0)
+        y1, *_ = by_picard(solver).step(terms, 0.0, h, y0, args, None, False)
+        before, after = (jnp.linalg.norm(ds.from_spinors(y), axis=-1) for y in (y0, y1))
+        return jnp.max(jnp.abs(after / before - 1))
+
+    changes = jax.jit(jax.vmap(change))(jr.split(jr.key(0), 1000))
+    assert jnp.max(changes) <= 1e-13
+
+
+def _warm_terms(H: Callable, path, alpha: float, T: float) -> diffrax.MultiTerm:
+    """The Landau-Lifshitz equation whose stationary density is exp(-H / T)."""
+    noise = lambda t, s, args: jnp.sqrt(2 * alpha * T) * s
+    return ds.spin_terms(lambda t, s, args: H(s), noise, path, damping=alpha)
+
+
+def _stationary_bias(
+    H: Callable, what: Callable, solver, hs, alpha: float, T: float, degree: int = 7
+) -> np.ndarray:
+    """What is too much in the means of `what(s)`, polynomials of one spin of length 1, in
+    the stationary law of steps of each size `hs`. Without sampling.
+
+    On the polynomials of the sphere up to `degree` (that is, its spherical harmonics),
+    made orthonormal in the density of Gibbs, a step is a matrix M of the means of
+    f_i(s0) f_j(s1). The moments c_j = E f_j of the stationary law solve c = c M, c_0 = 1.
+    """
+    n = 2 * degree + 4
+    z, weights = np.polynomial.legendre.leggauss(n)
+    phi = 2 * np.pi * np.arange(2 * n) / (2 * n)
+    z, phi = (x.ravel() for x in np.meshgrid(z, phi, indexing="ij"))
+    r = np.sqrt(1 - z**2)
+    s = jnp.stack([r * np.cos(phi), r * np.sin(phi), z], axis=-1)
+    weights = np.repeat(weights, 2 * n) * np.exp(-np.asarray(jax.vmap(H)(s)) / T)
+    weights /= np.sum(weights)
+
+    def powers(s):
+        w = s[0] + 1j * s[1]
+        values = [
+            part * s[2] ** k
+            for m in range(degree + 1)
+            for part in ([(w**m).real, (w**m).imag][: 1 + (m > 0)])
+            for k in range(degree - m + 1)
+        ]
+        return jnp.stack(values)
+
+    weighted = lambda fn: np.sqrt(weights)[:, None] * np.asarray(jax.vmap(fn)(s))
+    Q, R = np.linalg.qr(weighted(powers))
+    # The first polynomial is 1, and not -1.
+    Q, R = Q * np.sign(R[0, 0]), R * np.sign(R[0, 0])
+    terms = _warm_terms(H, solver.path((3,), jr.key(0), want="weak"), alpha, T)
+
+    @jax.jit
+    def after(h):
+        fn = lambda t, y, args: powers(ds.from_spinors(y))
+        mean = lambda s: ds.step_expectation(
+            terms, solver, 0.0, h, ds.to_spinors(s), fn=fn
+        )
+        return jax.lax.map(mean, s, batch_size=16)
+
+    seen = Q.T @ weighted(what)
+    biases = []
+    for h in hs:
+        f1 = np.linalg.solve(R.T, np.asarray(after(h)).T).T
+        M = Q.T @ (np.sqrt(weights)[:, None] * f1)
+        c = np.linalg.solve((np.eye(len(M)) - M)[1:, 1:].T, M[0, 1:])
+        biases.append(c @ seen[1:])
+    return np.array(biases)
+
+
+@pytest.mark.slow
+def test_stationary_law_of_one_spin_is_that_of_gibbs_up_to_the_square_of_the_step():
+    # In a field, with an easy axis beside it.
+    H = lambda s: -0.5 * s[2] - 0.4 * s[0] ** 2
+    what = lambda s: jnp.stack([s[2], s[0] ** 2])
+    hs = np.array([0.4, 0.2, 0.1])
+    solver = ds.NinomiyaVictoir()
+    # Beyond this degree the biases change in their fourth digit.
+    bias = _stationary_bias(H, what, solver, hs, alpha=0.5, T=0.6, degree=5)
+    assert np.max(np.abs(bias[-1])) <= 1e-3
+    for column in bias.T:
+        assert abs(slope(hs, column) - 2) <= 0.15
+
+
+def test_dampings_that_are_none_are_refused():
+    path = weak_path(3)
+    array = jnp.array([0.1, -0.1])
+    for wrong in (-0.1, jnp.nan, jnp.inf, 1j, "much", array, array > -1, 1j * array):
+        with pytest.raises(ValueError, match="`damping` must be a number"):
+            ds.spin_terms(H0, noise, path, damping=wrong)  # pyright: ignore
+    y0 = ds.to_spinors(jnp.ones((2, 3)))
+    args = _problem(jr.key(0), 2, 3)[1]
+    for shape in ((3,), (1,), (2, 1)):
+        terms = ds.spin_terms(H0, noise, path, damping=jnp.ones(shape))
+        with pytest.raises(ValueError, match=r"one for each spin, of shape \(2,\)"):
+            terms.terms[0].vf(0.0, y0, args)
+    each = ds.spin_terms(lambda t, s, args: s, noise, path, damping=1.0)
+    with pytest.raises(ValueError, match="`H0` must return a scalar"):
+        each.terms[0].vf(0.0, y0, args)
+    for solver in (ds.StormerVerlet(), ds.SRKw5(), ds.BAOAB()):
+        damped = ds.spin_terms(H0, noise, path, damping=1.0)
+        with pytest.raises(ValueError, match="use a solver for general systems"):
+            solver.init(damped, 0.0, 0.1, y0, args)
+
+    @jax.jit
+    @jax.vmap
+    def run(alpha):
+        terms = ds.spin_terms(H0, noise, path, damping=alpha)
+        at = terms, 0.0, 0.1, y0, args, None, False
+        return ds.ImplicitMidpoint().step(*at)[-1] == diffrax.RESULTS.successful
+
+    np.testing.assert_array_equal(
+        run(jnp.array([0.5, -0.5, jnp.nan, jnp.inf])), [True, False, False, False]
+    )
