@@ -104,7 +104,7 @@ ONE, FEW = (jnp.zeros(()), jnp.ones(())), ds.ValueFunctions
 def test_paths_of_an_ensemble_start_where_they_say_and_may_be_solved_again(engine):
     # The start of a path may depend on its own `args`.
     def start(key, args):
-        return jnp.zeros(()), jnp.sqrt(args["strength"]) * jr.normal(key)
+        return jr.normal(key), jnp.sqrt(args["strength"])
 
     solver = ds.StormerVerlet()
     given = TERMS, solver, 0.0, END, 0.25, start, strengths
@@ -114,12 +114,13 @@ def test_paths_of_an_ensemble_start_where_they_say_and_may_be_solved_again(engin
     def again(number):
         y0, args = paths.start(number)
         sol = diffrax.diffeqsolve(paths.terms(number), solver, 0.0, END, 0.25, y0, args)
-        return y0[1], sol.ys[1][0], y0[1] / jnp.sqrt(args["strength"])
+        return *y0, sol.ys[1][0], args["strength"]
 
-    starts, ends, ratios = jax.jit(jax.vmap(again))(jnp.arange(20))
-    np.testing.assert_allclose(paths.ys[1][:, 0], starts, rtol=1e-14)
-    np.testing.assert_allclose(paths.ys[1][:, 1], ends, rtol=1e-13)
-    assert len(np.unique(ratios)) == 20
+    p, q, ends, strength = jax.jit(jax.vmap(again))(jnp.arange(20))
+    np.testing.assert_allclose(q, np.sqrt(strength), rtol=1e-14)
+    np.testing.assert_allclose(paths.ys[0][:, 0], p, rtol=1e-14)
+    np.testing.assert_allclose(paths.ys[1], np.stack([q, ends], axis=1), rtol=1e-13)
+    assert len(np.unique(p)) == len(np.unique(q)) == 20
 
 
 def test_starts_and_terms_are_told_by_the_number_of_a_path():
