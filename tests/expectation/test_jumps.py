@@ -100,7 +100,10 @@ def test_a_jump_at_a_step_end_is_told_with_its_time_and_a_cure():
     message = _at_ends(_bath(_trap(_quench)), h=0.125, num_steps=16)
     assert "The forces jump at step ends, such as t=1, and `BAOAB` takes one" in message
     assert "pass `BAOAB(ImplicitMidpoint())`" in message
-    for within_steps in (ds.BAOAB(ds.ImplicitMidpoint()), ds.LangevinMiddle()):
+    kick = ds.Kick(1 / 2)
+    flight = ds.Flight(1 / 2)
+    in_the_middle = ds.Splitting([flight, kick, ds.Bath(1), kick, flight])
+    for within_steps in (ds.BAOAB(ds.ImplicitMidpoint()), in_the_middle):
         assert _at_ends(_bath(_trap(_quench)), within_steps) is None
     # t = 1 is the middle of a step of 0.4.
     assert _at_ends(_bath(_trap(_quench)), h=0.4) is not None
