@@ -388,6 +388,7 @@ REFUSED = {
     ],
     "`devices` must be a list of one or more devices": [
         lambda: _drawn(devices=[]),
+        lambda: _mean(devices="cpu"),
         lambda: _mean(devices=DEVICE),
     ],
     "`devices` must differ": [lambda: _drawn(devices=[DEVICE, DEVICE])],
@@ -401,6 +402,7 @@ REFUSED = {
             lambda: _compared(key=keys),
         )
     ],
+    "`expectation` needs a random key": [lambda: _mean(key=3)],
     "`compare_solvers` needs a random key": [
         lambda: _compared(key=0),
         lambda: _compared(key=None),
@@ -415,6 +417,7 @@ REFUSED = {
     ],
     "`levels` must be an integer from 1 to": [
         lambda: _mean(levels=2000),
+        lambda: _mean(levels=0),
         lambda: _drawn(levels=2000, order=1),
     ],
     "paths take .* GB or more, of .* GB. Pass a smaller `batch_size`": [

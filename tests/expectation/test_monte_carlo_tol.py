@@ -120,8 +120,11 @@ def test_an_order_of_one_half_removes_powers_of_the_root_of_the_step():
 
 
 def test_one_word_for_a_tolerance_that_was_not_reached():
-    with pytest.warns(UserWarning, match="`tol=1e-06` was not reached: .* 100 paths"):
+    said = "`tol=1e-06` was not reached: .* 100 paths"
+    with pytest.warns(UserWarning, match=said) as told:
         got = ds.monte_carlo(jr.normal, key=jr.key(0), num_paths=100, tol=1e-6)
+    needed = 100 * (float(got.std_error) / 1e-6) ** 2
+    assert f"takes about {needed:.1e} paths" in str(told[0].message)
     assert got.tol_reached is False and "`tol` was not reached" in str(got)
 
 
