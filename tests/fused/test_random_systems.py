@@ -16,15 +16,14 @@ from .fuzz import NUM_CASES
 pytestmark = needs_drjit
 
 # A process takes seconds to start, so several systems share one.
-GROUPS = [range(0, 12)] + [
-    range(begin, min(begin + 12, NUM_CASES)) for begin in range(12, NUM_CASES, 12)
+GROUPS = [range(0, 4)] + [
+    range(begin, min(begin + 9, NUM_CASES)) for begin in range(4, NUM_CASES, 9)
 ]
-MAY_BE_REFUSED = set()
 # Four steps; units in the last place of the largest number.
 ULPS = 32
 
 
-def measured(numbers: list[int]) -> tuple[dict[int, float | str], str]:
+def measured(numbers: list[int]) -> tuple[dict[int, float], str]:
     """How far the engines are apart, up to the first system that ends the process; and
     what the process wrote last."""
     done = subprocess.run(
@@ -51,7 +50,4 @@ def test_systems_of_all_parts_have_the_same_paths(group):
         if left:
             ended[left.pop(0)] = message
     assert not ended
-    refused = {number for number, ulps in apart.items() if ulps == "refused"}
-    assert refused <= MAY_BE_REFUSED
-    solved = {number: ulps for number, ulps in apart.items() if number not in refused}
-    assert {number: ulps for number, ulps in solved.items() if ulps > ULPS} == {}
+    assert {number: ulps for number, ulps in apart.items() if ulps > ULPS} == {}
