@@ -68,24 +68,6 @@ def random_problem(key, d: int, m: int, dtype=jnp.float64) -> tuple[PyTree, PyTr
     return (p, q), args
 
 
-def random_problem_of_any_size(key, dtype) -> tuple[PyTree, PyTree]:
-    """As `random_problem` for random `d` and `m` from 1 to 3, in arrays of size 3: the
-    Hamiltonians do not depend on the other coordinates, the other noises vanish."""
-    k_problem, k_d, k_m = jr.split(key, 3)
-    y0, args = random_problem(k_problem, 3, 3, dtype)
-    used_d = jnp.arange(3) < jr.randint(k_d, (), 1, 4)
-    used_m = jnp.arange(3) < jr.randint(k_m, (), 1, 4)
-
-    def restrict(coefficients, noises):
-        a, u, v, phi = coefficients
-        return (jnp.where(noises, a, 0), u * used_d, v * used_d, phi)
-
-    return y0, {
-        "drift": restrict(args["drift"], True),
-        "noise": restrict(args["noise"], used_m[:, None]),
-    }
-
-
 class System(eqx.Module):
     """Random systems of one structure, the parameters in `args`."""
 

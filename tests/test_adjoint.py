@@ -20,6 +20,7 @@ from diffrax_symplectic._adjoint import (
 from diffrax_symplectic._solver import AbstractLangevinSplitting, LANGEVIN, SOLVERS
 from diffrax_symplectic._tableau import FlatTableau, is_own_inverse, Stage
 
+from .families import slow_except
 from .problems import (
     as_friction,
     damped_terms,
@@ -192,30 +193,30 @@ def gradients(solver, noise, saveat, dtype=jnp.float64, parts=slice(None), **opt
     return [jax.tree.leaves(g) for g in jax.jit(both)((stiffness, args, y0))]
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        (ds.ImplicitMidpoint(), phase, diffrax.SaveAt(ts=SAVED), {}),
-        (
-            # Here, the first steps lie before the first saved time.
-            *(ds.StormerVerlet(), kicks, diffrax.SaveAt(ts=SAVED[4::-1])),
-            dict(t0=1.03, t1=0.0, dt0=-0.1),
-        ),
-        (
-            *(ds.StormerVerlet(), kicks, diffrax.SaveAt(t1=True)),
-            dict(dt0=None, stepsize_controller=diffrax.StepTo(TO)),
-        ),
-    ],
-    ids=["times", "backward", "StepTo"],
-)
-def test_gradients_are_those_of_checkpointing(case):
-    solver, noise, saveat, options = case
+CASES = {
+    "times": (ds.ImplicitMidpoint(), phase, diffrax.SaveAt(ts=SAVED), {}),
+    # Here, the first steps lie before the first saved time.
+    "backward": (
+        *(ds.StormerVerlet(), kicks, diffrax.SaveAt(ts=SAVED[4::-1])),
+        dict(t0=1.03, t1=0.0, dt0=-0.1),
+    ),
+    "StepTo": (
+        *(ds.StormerVerlet(), kicks, diffrax.SaveAt(t1=True)),
+        dict(dt0=None, stepsize_controller=diffrax.StepTo(TO)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", slow_except(["times"], CASES))
+def test_gradients_are_those_of_checkpointing(name):
+    solver, noise, saveat, options = CASES[name]
     got, expected = gradients(solver, noise, saveat, **options)
     assert min(np.abs(x).min() for x in expected) > 1e-3
     for a, b in zip(got, expected, strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_gradients_in_single_precision_of_a_part_of_the_state_are_those_of_checkpointing():
     saveat, dtype = diffrax.SaveAt(ts=SAVED.astype(jnp.float32)), jnp.float32
     options = dict(saveat=saveat, dtype=dtype, parts=slice(1))
@@ -272,12 +273,10 @@ def test_a_way_back_that_is_lost_is_reported_for_that_path_alone():
         jax.block_until_ready(gradient(1, True))
 
 
-@pytest.mark.parametrize(
-    "path", [weak_path(1), ds.FixedStepBrownianPath((1,), jr.key(3))]
-)
 @pytest.mark.slow
-def test_the_way_back_leads_to_rest(path):
+def test_the_way_back_leads_to_rest():
     # Three-point increments are zero in two steps of three: several first steps may rest.
+    path = weak_path(1)
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + 1 - jnp.sum(jnp.cos(q))
     terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: args * q, path)
 
@@ -351,15 +350,13 @@ def test_what_reversing_cannot_do_is_refused_with_advice():
         ds.ReversingAdjoint(checkpoints=0)
 
 
-@pytest.mark.parametrize(
-    "solver", [ds.ImplicitMidpoint(), ds.StormerVerlet()], ids=repr
-)
-def test_backsolve_is_refused_with_advice(solver):
+def test_backsolve_is_refused_with_advice():
     # It takes steps of its own, which have other increments of a weak path, and its state
     # is no pair (p, q).
     path = weak_path(1)
     terms = ds.hamiltonian_terms(separable_H0, lambda t, p, q, args: q, path)
     y0 = jnp.ones(1), jnp.ones(1)
+    solver = ds.StormerVerlet()
     adjoint = diffrax.BacksolveAdjoint()
     end = lambda y0: jnp.sum(
         diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.3, y0, adjoint=adjoint).ys[1]
@@ -368,27 +365,22 @@ def test_backsolve_is_refused_with_advice(solver):
         jax.grad(end)(y0)
 
 
-@pytest.mark.parametrize(
-    "inner, form",
-    [
-        (ds.StormerVerlet(), jnp.array([[1.0, 0.4], [0.4, 0.7]])),
-        (ds.ImplicitMidpoint(), jnp.array(1.0)),
-    ],
-    ids=["matrix", "number"],
-)
 @pytest.mark.slow
-def test_friction_beside_a_flow_is_walked_back_too(inner, form):
+def test_friction_beside_a_flow_is_walked_back_too():
+    form = jnp.array([[1.0, 0.4], [0.4, 0.7]])
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 - args * jnp.sum(jnp.cos(q + t))
     noise = lambda t, p, q, args: args * jnp.sum(jnp.sin(q))
     path = ds.WeakBrownianPath((), jr.key(0))
     make = lambda friction: damped_terms(H0, friction, noise, path)
-    solver, y0 = ds.BAOAB(inner), (jnp.array([0.3, 0.1]), jnp.array([0.5, -0.2]))
+    solver, y0 = (
+        ds.BAOAB(ds.StormerVerlet()),
+        (jnp.array([0.3, 0.1]), jnp.array([0.5, -0.2])),
+    )
 
     @jax.jit
     def gradients(gamma):
         def loss(y0, args, gamma, adjoint):
-            friction = gamma * form
-            terms = make(as_friction(friction) if form.ndim else friction)
+            terms = make(as_friction(gamma * form))
             sol = diffrax.diffeqsolve(
                 terms, solver, 0.0, 2.0, 0.1, y0, args, adjoint=adjoint
             )

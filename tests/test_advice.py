@@ -13,6 +13,8 @@ from diffrax_symplectic._suggest import FOR_FRICTION, FOR_MEANS, FOR_PATHS
 from examples.stability import friction
 from examples.stability._models import stationary, with_newton
 
+from .families import slow_except
+
 
 ONE = jnp.array(0.5), jnp.array(1.0)
 # Steps of explicit solvers, and others for implicit ones.
@@ -40,7 +42,13 @@ def _maps(terms, solver, hs):
     return np.asarray(jax.jit(jax.vmap(one), compiler_options=options)(hs))
 
 
-@pytest.mark.parametrize("kind", MEASURED, ids=lambda kind: kind.__name__)
+# An explicit, an implicit and a splitting one; the rest is for the whole suite.
+QUICK = ds.StormerVerlet, ds.ImplicitMidpoint, ds.BAOAB
+
+
+@pytest.mark.parametrize(
+    "kind", slow_except(QUICK, MEASURED), ids=lambda kind: kind.__name__
+)
 def test_facts_about_noise_on_harmonic_modes_are_measured(kind):
     solver = with_newton(kind())
     path = kind().path((), jr.key(0), want="weak")
@@ -84,7 +92,10 @@ def test_friction_is_measured_for_all_solvers_suggested_for_it():
         assert _names(ds.suggest_solver(terms, 0.0, ONE, want=want)) <= measured
 
 
-@pytest.mark.parametrize("name", friction.CASES)
+FIRST = list(friction.CASES)[:2]
+
+
+@pytest.mark.parametrize("name", slow_except(FIRST, friction.CASES))
 def test_reasons_name_the_friction_that_exact_second_moments_allow(name):
     solver = friction.CASES[name]
     limit = friction.limit(friction.energies(solver))
@@ -154,18 +165,21 @@ def test_two_levels_hold_up_to_the_frequency_of_the_record(kind):
     assert share(hs[2], two, one) >= 0.15
 
 
-@pytest.mark.parametrize("h", [*RESOLVED, *STIFF])
-def test_without_brackets_levy_areas_change_nothing(h):
+def test_without_brackets_levy_areas_change_nothing():
     """So the facts about noise on harmonic modes are those of the midpoint rule."""
+    hs = jnp.concatenate([RESOLVED, STIFF])
     push = lambda t, p, q, args: jnp.stack([-q, -2 * q])
     path = ds.LevyAreaMidpoint().path((2,), jr.key(0), want="strong")
     terms = ds.hamiltonian_terms(_well, push, path)
     ends = []
     for solver in (ds.LevyAreaMidpoint(), ds.ImplicitMidpoint()):
         solver = with_newton(solver)
-        state = solver.init(terms, 0.0, h, ONE, None)
-        y1, *_ = solver.step(terms, 0.0, h, ONE, None, state, made_jump=False)
-        ends.append(jnp.stack(y1))
+
+        def end(h, solver=solver):
+            state = solver.init(terms, 0.0, h, ONE, None)
+            return solver.step(terms, 0.0, h, ONE, None, state, made_jump=False)[0]
+
+        ends.append(jnp.stack(jax.jit(jax.vmap(end))(hs)))
     np.testing.assert_allclose(*ends, rtol=0, atol=1e-13)
     of_levy, of_midpoint = ds.LevyAreaMidpoint.record, ds.ImplicitMidpoint.record
     assert of_levy.right_energy_unresolved is of_midpoint.right_energy_unresolved

@@ -69,9 +69,7 @@ def test_terms_of_a_path_are_complete_if_the_terms_had_a_shape():
     np.testing.assert_allclose(paths.ys[1][7], sol.ys[1][-1], rtol=1e-14)
 
 
-@pytest.mark.parametrize(
-    "solver", [ds.AdditiveGauss(), ds.SRKw5(), ds.NinomiyaVictoir()]
-)
+@pytest.mark.parametrize("solver", [ds.SRKw5(), ds.NinomiyaVictoir()])
 @pytest.mark.slow
 def test_weak_methods_have_no_paths_with_the_law_of_the_solution(solver):
     kick = ds.hamiltonian_terms(pendulum, lambda t, p, q, args: -q, ())
@@ -88,12 +86,11 @@ def test_weak_methods_have_no_paths_with_the_law_of_the_solution(solver):
 
 
 @both_engines
-@pytest.mark.parametrize("solver", [ds.StormerVerlet(), ds.ImplicitMidpoint()])
 def test_a_shape_becomes_a_path_with_gaussian_increments_unless_a_weak_one_is_wanted(
-    engine, solver
+    engine,
 ):
     kick = ds.hamiltonian_terms(pendulum, lambda t, p, q, args: -q, ())
-    once = dict(terms=kick, solver=solver, t1=0.25, num_paths=200, engine=engine)
+    once = dict(terms=kick, t1=0.25, num_paths=200, engine=engine)
     values = lambda paths: len(np.unique(np.round(paths.ys[0], 12)))
     assert values(follow(**once)) == 200
     assert values(follow(**once, want="weak")) == 3
@@ -114,10 +111,9 @@ def test_without_times_the_ends_are_returned(engine):
 
 
 @both_engines
-@pytest.mark.parametrize("batch_size", [1, 7, 40])
-def test_a_path_does_not_depend_on_its_batch(engine, batch_size):
+def test_a_path_does_not_depend_on_its_batch(engine):
     whole = follow(engine=engine, num_paths=50, solver=ds.ImplicitMidpoint())
-    parts = follow(engine=engine, batch_size=batch_size, solver=ds.ImplicitMidpoint())
+    parts = follow(engine=engine, batch_size=7, solver=ds.ImplicitMidpoint())
     tolerance = 0.0 if engine == "drjit" else 1e-15
     np.testing.assert_allclose(parts.ys[1], whole.ys[1][:40], rtol=tolerance, atol=0)
 
@@ -192,10 +188,6 @@ def test_an_error_within_a_step_is_raised():
         follow(terms, args=jnp.array(0.5), engine="drjit")
 
 
-def waves(t, p, q, args):
-    return jnp.sum(p**2) / 2 + jnp.sum(jnp.abs(jnp.fft.fft(q)) ** 2)
-
-
 def ordered(t, p, q, args):
     return jnp.sum(p**2) / 2 + jnp.sort(jnp.tile(q, 6))[0] ** 2
 
@@ -222,19 +214,10 @@ def short(t, p, q, args):
     return jnp.sum(p**2) / 2 + jnp.sum(q.astype(jnp.float16))
 
 
-def deep(t, p, q, args):
-    def once(i, x):
-        return jax.lax.cond(x > 0, lambda: x * jnp.exp(jax.lax.lgamma(x)), lambda: x)
-
-    outer = lambda i, x: jax.lax.fori_loop(0, 12, once, x)
-    return jnp.sum(p**2) / 2 + jax.lax.fori_loop(0, 12, outer, q[0])
-
-
 REFUSED = [
     (several, "`stablehlo.fft`"),
     (in_bits, "`stablehlo.bitcast_convert` between numbers of different sizes"),
     (short, "numbers of type `f16`"),
-    (waves, "`stablehlo.fft`"),
     (ordered, "`stablehlo.sort` of more than 16 numbers"),
     (
         table,
@@ -263,14 +246,6 @@ def test_what_cannot_be_replayed_is_named_with_the_function_that_needs_it(H0, wh
     assert 'Pass `engine="jax"`' in str(info.value)
     # And what comes after that is as before.
     assert follow(engine="drjit").num_failed == 0
-
-
-@needs_drjit
-def test_of_branches_in_loops_in_loops_the_operation_is_named():
-    path = ds.WeakBrownianPath((), jr.key(0))
-    terms = ds.hamiltonian_terms(deep, lambda t, p, q, args: q[0], path)
-    with pytest.raises(ValueError, match="cannot replay `chlo.(lgamma|digamma)`"):
-        follow(terms, y0=(jnp.zeros(3), jnp.arange(3.0)), engine="drjit")
 
 
 @needs_drjit

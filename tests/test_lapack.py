@@ -1,10 +1,5 @@
 """Calls of LAPACK that could run side by side wait for each other, and change nothing."""
 
-import os
-import subprocess
-import sys
-import textwrap
-
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -12,13 +7,8 @@ import numpy as np
 import pytest
 
 from diffrax_symplectic import _lapack
-from diffrax_symplectic._compat import has_blocking_lapack, Literal, programs_in
+from diffrax_symplectic._compat import Literal, programs_in
 from diffrax_symplectic._lapack import lapack_in_turn
-
-
-blocking = pytest.mark.skipif(
-    not has_blocking_lapack(), reason="This version of JAX has no such calls."
-)
 
 
 def solution(x, shift):
@@ -106,63 +96,6 @@ def test_a_function_without_lapack_stays_as_it_is(monkeypatch):
     x = jnp.linspace(0, 1, 4)
     plain, in_turn = (jax.jit(f).lower(x).as_text() for f in (fn, lapack_in_turn(fn)))
     assert in_turn == plain
-
-
-PROGRAM = """
-    import os, sys
-    # Two threads in XLA's pool: two calls that wait suffice.
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, [*os.sched_getaffinity(0)][:2])
-    import jax
-    import jax.numpy as jnp
-    import jax.random as jr
-    import diffrax_symplectic as ds
-
-    n, kind, call = int(sys.argv[1]), sys.argv[2], sys.argv[3]
-    jax.config.update("jax_enable_x64", True)
-
-    def potential(q, shift):
-        matrix = 2 * jnp.eye(n) + 0.1 * jnp.cos(q[:, None] - q + shift)
-        matrix = (matrix + matrix.T) / 2
-        if kind == "solve":
-            return q @ jnp.linalg.solve(matrix, q)
-        return jnp.sum(jnp.linalg.cholesky(matrix))
-
-    def H0(t, p, q, args):
-        return p @ p / 2 + sum(potential(q, k) for k in range(8))
-
-    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: -q, (n,))
-    y0 = jnp.zeros(n), jnp.ones(n)
-    given = terms, ds.StormerVerlet(), 0, 2, 0.1, y0
-    size = 2**16 if n == 2 else 2**13
-    if call == "ensemble":
-        out = ds.ensemble(*given, key=jr.key(1), num_paths=size).ys
-    else:
-        sampling = ds.IndependentPaths(size, batch_size=size)
-        phi = lambda t, y, args: y[1]
-        out = ds.expectation(phi, *given, key=jr.key(1), sampling=sampling).mean
-    assert all(bool(jnp.all(jnp.isfinite(x))) for x in jax.tree.leaves(out))
-"""
-slow = pytest.mark.slow
-
-
-@blocking
-@pytest.mark.parametrize(
-    "n, kind, call",
-    [
-        pytest.param(5, "solve", "expectation", marks=slow),
-        pytest.param(5, "cholesky", "ensemble", marks=slow),
-        (2, "solve", "ensemble"),
-        pytest.param(2, "cholesky", "expectation", marks=slow),
-    ],
-)
-def test_many_calls_of_lapack_return(n, kind, call):
-    """Without turns this program never ends."""
-    # As users run it: with little optimization fewer calls meet.
-    env = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
-    env["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "0"
-    program = [sys.executable, "-c", textwrap.dedent(PROGRAM), str(n), kind, call]
-    subprocess.run(program, env=env, check=True, timeout=300)
 
 
 @pytest.mark.parametrize("name", ["cholesky", "eigh", "eigvals", "inv", "qr", "svd"])

@@ -221,16 +221,6 @@ def test_a_failed_step_has_no_expectation_and_says_why():
         mean(jnp.nan)
 
 
-def test_moments_work_under_jit_and_vmap():
-    path = ds.WeakBrownianPath((), jr.key(0))
-    maps = lambda h: ds.second_moment_map(
-        kubo_terms(path), ds.ImplicitMidpoint(), 0.0, h, Y0
-    )
-    hs = jnp.array([0.1, 0.2])
-    together = jax.jit(jax.vmap(maps))(hs)
-    np.testing.assert_allclose(together[1], maps(hs[1]), atol=1e-13)
-
-
 class _NoiseInTwoPlaces(ds.AbstractSymplecticSolver):
     """Only noise, as the sum of two parts of it."""
 

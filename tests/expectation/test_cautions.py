@@ -12,6 +12,9 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation.estimate.estimate import _rounded
+from diffrax_symplectic._expectation.out_of_range import out_of_range
+
+from .steps import problem_of
 
 
 KEY = jr.key(0)
@@ -61,6 +64,7 @@ def test_times_stand_beside_rows_also_from_files_and_merged(tmp_path):
     for estimate in (one, loaded, loaded.merge(other)):
         lines = str(estimate).splitlines()
         names = [line.split(":")[0] for line in lines[:4]]
+        assert lines[4] == "not included: the discretization error (see `levels`)"
         assert names == [f"t={t}, ['both'][{k}]" for t in ("0.3", "1") for k in (0, 1)]
     # A file of an earlier version has no times.
     with np.load(tmp_path / "one.npz") as arrays:
@@ -101,25 +105,21 @@ def test_a_mean_that_is_zero_within_its_spread_is_no_disagreement():
     assert _by_levels([0.09, 0.0], 0.01)
 
 
-def _junction(mass, T, args=None):
-    single = jax.ShapeDtypeStruct((), jnp.float32)
-    H0 = lambda t, p, q, args: p**2 / (2 * mass) - jnp.cos(q)
-    terms = ds.langevin_terms(H0, jnp.float32(1), jnp.float32(T), single)
-    y0 = jnp.float32(0), jnp.float32(1)
-    phi = lambda t, y, args: jnp.cos(y[1])
-    return ds.expectation(
-        phi, terms, ds.BAOAB(), 0, 0.5, 0.25, y0, args, key=KEY,
-        sampling=ds.ArrayRQMC(num_paths=64, replicates=2),
-    )  # fmt: skip
+def test_numbers_that_single_precision_loses_are_named():
+    def said(mass=1.0, T=1.0, args=None, all_fail=False):
+        single = jax.ShapeDtypeStruct((), jnp.float32)
+        H0 = lambda t, p, q, args: p**2 / (2 * jnp.float32(mass)) - jnp.cos(q)
+        terms = ds.langevin_terms(H0, jnp.float32(1), jnp.float32(T), single)
+        y0 = jnp.float32(0), jnp.float32(1)
+        problem = problem_of(terms, ds.BAOAB(), 0.25, y0, args)
+        return out_of_range(problem, all_fail)
 
-
-def test_numbers_that_single_precision_loses_are_named_once():
-    (message,) = _told(lambda: _junction(jnp.float32(1.1e-44), 1.0))
-    assert message.startswith(
-        "128 paths failed: there is no mean. In float32, 2 * 1.1e"
-    )
-    assert "is 0. Pass `y0` and what goes with it in float64" in message
-    told = " ".join(_told(lambda: _junction(1.0, 1e-42)))
-    assert "In float32, `temperature` of 1e-42 counts as zero." in told
-    told = " ".join(_told(lambda: _junction(1.0, 1.0, {"length": 1e60, "fn": jnp.sin})))
-    assert "In float32, `args` of 1e+60 counts as infinite." in told
+    assert said() is None
+    advice = "Pass `y0` and what goes with it in float64, or choose units"
+    lost = said(mass=1.1e-44, all_fail=True)
+    assert lost.startswith("In float32, 2 * 1.1e")
+    assert f"is 0. {advice}" in lost
+    cold = said(T=1e-42)
+    assert cold.startswith("In float32, `temperature` of 1e-42 counts as zero.")
+    long = said(args={"length": 1e60, "fn": jnp.sin})
+    assert long.startswith("In float32, `args` of 1e+60 counts as infinite.")

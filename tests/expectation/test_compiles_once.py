@@ -38,14 +38,7 @@ def phi(t, y, args):
 
 # What differs from the first call.
 CHANGES = {
-    "key": dict(key=jr.key(7)),
-    "args": dict(args=jnp.array(0.8)),
-    "y0": dict(y0=(jnp.array(0.2), jnp.array(0.7))),
     "numbers of Python in y0": dict(y0=(0.2, 0.7)),
-    "t0 and t1": dict(t0=1.0, t1=1.5),
-    "dt0": dict(dt0=0.25, t1=1.0),
-    "friction": dict(friction=jnp.array(0.7)),
-    "temperature": dict(temperature=jnp.array(0.2)),
     "everything": dict(
         key=jr.key(8), args=jnp.array(0.3), y0=(jnp.array(0.1), jnp.array(0.2)),
         t0=0.5, t1=1.5, dt0=0.25, friction=jnp.array(0.1), temperature=jnp.array(3.0),

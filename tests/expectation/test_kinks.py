@@ -91,8 +91,6 @@ def test_a_shape_becomes_a_gaussian_path_where_phi_jumps():
     assert isinstance(estimate.sampling, ds.ArrayRQMC)
     assert "Gaussian increments" in estimate.reason
     assert abs(estimate.mean - ndtr(-0.5)) < 4 * estimate.std_error < 2e-3
-    smooth = mean(lambda t, y, args: y[0] ** 2, walk(()))
-    assert isinstance(smooth.sampling, ds.ValueFunctions)
 
 
 def test_a_weak_method_has_no_gaussian_path():

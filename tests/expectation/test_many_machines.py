@@ -15,6 +15,8 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation.sampling import AbstractSampling
 
+from ..families import slow_except
+
 
 KEY = jr.key(3)
 Y0 = (jnp.array(0.0), jnp.array(1.0))
@@ -59,7 +61,7 @@ def _leaves(tree) -> list:
     return [tree["q2"], tree["both"][0], tree["both"][1]]
 
 
-@pytest.mark.parametrize("name", SAMPLINGS)
+@pytest.mark.parametrize("name", slow_except(["IndependentPaths"], SAMPLINGS))
 def test_parts_are_one_run_to_the_last_bit_in_any_order(name, tmp_path):
     unit = 2 if name == "ArrayRQMC" else 16
     cut = [0, 2 * unit, 3 * unit, 7 * unit]

@@ -33,7 +33,7 @@ def _by_hand(fn, key, n):
     return jax.vmap(lambda i: fn(jr.fold_in(jr.fold_in(key, 0), i)))(index)
 
 
-@pytest.mark.parametrize("batch_size", [7, 64, 1000, 4096])
+@pytest.mark.parametrize("batch_size", [7, 4096])
 def test_mean_and_standard_error_are_those_of_all_paths(batch_size):
     key = jr.key(1)
     got = ds.monte_carlo(_normal, key=key, num_paths=1000, batch_size=batch_size)
@@ -65,12 +65,10 @@ def test_single_precision_is_accumulated_in_double():
     np.testing.assert_allclose(got.variance, x.var(ddof=1), rtol=1e-4)
 
 
-@pytest.mark.parametrize("n", [1000, 1023])
-def test_the_mean_of_a_constant_in_single_precision_is_that_constant(n):
+def test_the_mean_of_a_constant_in_single_precision_is_that_constant():
     third = jnp.float32(1 / 3)
-    got = ds.monte_carlo(
-        lambda key: third + 0 * jr.normal(key, (), "f4"), key=jr.key(0), num_paths=n
-    )
+    same = lambda key: third + 0 * jr.normal(key, (), "f4")
+    got = ds.monte_carlo(same, key=jr.key(0), num_paths=1023)
     assert got.mean == np.float64(third)
     # It is known no better than it is rounded.
     np.testing.assert_allclose(got.std_error, np.finfo(np.float32).eps / 3)
@@ -120,10 +118,11 @@ def test_failures_are_counted_if_they_are_reported_and_raised_if_they_are_thrown
 
     def fn(key, throw):
         """A solve that stops after half of its steps."""
-        terms = ds.hamiltonian_terms(H, H, ds.WeakBrownianPath((), key))
+        path = ds.WeakBrownianPath((), key)
+        terms = ds.hamiltonian_terms(H, lambda t, p, q, args: -q, path)
         y0 = (jnp.array(0.0), jnp.array(1.0))
         sol = diffrax.diffeqsolve(
-            terms, ds.SRKw1(), 0.0, 1.0, 0.1, y0, throw=throw, max_steps=5
+            terms, ds.StormerVerlet(), 0.0, 1.0, 0.1, y0, throw=throw, max_steps=5
         )
         return sol.ys[1][-1], sol.result
 
@@ -193,15 +192,6 @@ def test_an_interrupt_loses_only_what_is_running():
     np.testing.assert_allclose(rest.mean["x"], whole.mean["x"], rtol=1e-14)
 
 
-def test_progress_is_shown(capfd):
-    meter = diffrax.TextProgressMeter()
-    ds.monte_carlo(
-        _normal, key=jr.key(0), num_paths=1000, batch_size=100, progress_meter=meter
-    )
-    jax.effects_barrier()
-    assert "%" in capfd.readouterr().out
-
-
 @pytest.mark.parametrize("meter", ["TqdmProgressMeter", "TextProgressMeter"])
 def test_meters_of_diffrax_take_expectations(meter, capfd):
     meter = getattr(diffrax, meter)()
@@ -264,27 +254,6 @@ def test_an_estimate_prints_every_number_of_the_mean_in_a_line_with_its_place():
     assert lines[29] == "['a'][4, 5]: 1.000000000000000 ± 2.2e-16"
     assert lines[30] == "['b']: 2.000000000000000 ± 4.4e-16"
     assert len(lines) == 33 and "10 paths on 1 level, 0 failed" in lines[-1]
-
-
-def test_an_estimate_prints_the_digits_that_it_has_and_what_it_leaves_out():
-    H = lambda t, p, q, args: (p**2 + q**2) / 2
-    terms = ds.hamiltonian_terms(H, H, ds.WeakBrownianPath((), jr.key(0)))
-    run = lambda levels: ds.expectation(
-        lambda t, y, args: y[1], terms, ds.ImplicitMidpoint(), 0, 1, 0.25,
-        (jnp.array(0.0), jnp.array(1.0)), key=jr.key(1), levels=levels,
-        sampling=ds.IndependentPaths(256),
-    )  # fmt: skip
-    one, two = run(1), run(2)
-    first, said = str(one).splitlines()[:2]
-    # An error of a few hundredths: two digits of it are three after the point.
-    assert 0.01 < one.std_error < 0.1
-    assert first == f"{one.mean:.3f} ± {one.std_error:.1e}"
-    assert said == "not included: the discretization error (see `levels`)"
-    assert "not included" not in str(two)
-    assert str(two).startswith(
-        f"{two.mean:.3f} ± {two.error:.1e} (sampling {two.std_error:.1e}, "
-        f"discretization {two.discretization_error:.1e})"
-    )
 
 
 def test_old_style_keys_will_do():
@@ -429,6 +398,7 @@ def _mean_gradient() -> float:
     return np.mean(by_hand(jr.key(0)))
 
 
+@pytest.mark.slow
 def test_gradients_are_taken_within():
     one = jax.devices()[:1]
     got = ds.monte_carlo(_gradient(), key=jr.key(0), num_paths=100, devices=one)

@@ -1,8 +1,5 @@
 """Quasi-random points, and the order in which paths receive them."""
 
-import gc
-import weakref
-
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -98,12 +95,3 @@ def test_sorting_is_a_permutation_by_place_with_the_failed_ones_last(x64):
     assert set(order[-3:]) == {3, 5, 77}
     good = np.clip(np.asarray(z)[order[:-3], 0], -2, 2)
     assert np.all(np.diff(good) > -1e-3)
-
-
-@pytest.mark.slow
-def test_only_the_last_set_of_points_is_kept():
-    first = weakref.ref(sobol_points(64, 3))
-    assert sobol_points(64, 3) is first()
-    sobol_points(64, 2)
-    gc.collect()
-    assert first() is None

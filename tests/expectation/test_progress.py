@@ -12,7 +12,7 @@ from diffrax_symplectic._expectation.progress import NO_METER, Progress
 
 def test_a_long_call_prints_one_line(monkeypatch, capsys):
     monkeypatch.setattr(progress_module, "_SECONDS_OF_SILENCE", 0.01)
-    ds.monte_carlo(jr.normal, key=jr.key(0), num_paths=2**20, batch_size=2**10)
+    ds.monte_carlo(jr.normal, key=jr.key(0), num_paths=2**14, batch_size=2**10)
     printed = capsys.readouterr()
     assert printed.out == ""
     assert printed.err.startswith("`monte_carlo` after 0 s: ")

@@ -81,13 +81,6 @@ def test_value_functions_leave_the_variance_of_the_start():
     assert abs(estimate.mean[0] - exact(0.01)) < 4 * estimate.std_error[0]
 
 
-@needs_drjit
-def test_the_fused_engine_draws_the_same_starts():
-    parts = [mean(SAMPLINGS[0], engine=engine) for engine in ("jax", "drjit")]
-    for own, other in zip(*[jax.tree.leaves(x.mean) for x in parts]):
-        np.testing.assert_allclose(own, other, rtol=1e-12)
-
-
 def test_parts_of_an_estimate_draw_the_samples_of_the_whole():
     half = ds.IndependentPaths(100, batch_size=50)
     first, second = mean(half), mean(half, first=100)
@@ -108,43 +101,31 @@ ONE, FEW = (jnp.zeros(()), jnp.ones(())), ds.ValueFunctions
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-def test_paths_of_an_ensemble_start_where_they_say(engine):
+def test_paths_of_an_ensemble_start_where_they_say_and_may_be_solved_again(engine):
     # The start of a path may depend on its own `args`.
     def start(key, args):
-        return jnp.zeros(()), jnp.sqrt(args["strength"]) * jr.normal(key)
+        return jr.normal(key), jnp.sqrt(args["strength"])
 
     solver = ds.StormerVerlet()
     given = TERMS, solver, 0.0, END, 0.25, start, strengths
     how = dict(key=jr.key(1), num_paths=20, batch_size=8, engine=engine)
     paths = ds.ensemble(*given, **how, ts=[0.0, END])
-    for i in (0, 13, 19):
-        y0, args = paths.start(i)
-        assert paths.ys[1][i, 0] == y0[1]
-        terms = paths.terms(i)
-        sol = diffrax.diffeqsolve(terms, solver, 0.0, END, 0.25, y0, args)
-        np.testing.assert_allclose(paths.ys[1][i, 1], sol.ys[1][0], rtol=1e-13)
-    ratios = paths.ys[1][:, 0] / np.sqrt(
-        [paths.start(i)[1]["strength"] for i in range(20)]
-    )
-    assert len(np.unique(ratios)) == 20
-
-
-def test_paths_of_an_ensemble_may_be_solved_again_in_a_batch():
-    def start(key, args):
-        return jnp.zeros(()), jnp.sqrt(args["strength"]) * jr.normal(key)
-
-    solver = ds.StormerVerlet()
-    given = TERMS, solver, 0.0, END, 0.25, start, strengths
-    paths = ds.ensemble(*given, key=jr.key(1), num_paths=20)
 
     def again(number):
         y0, args = paths.start(number)
-        terms = paths.terms(number)
-        return diffrax.diffeqsolve(terms, solver, 0.0, END, 0.25, y0, args).ys[1][0]
+        sol = diffrax.diffeqsolve(paths.terms(number), solver, 0.0, END, 0.25, y0, args)
+        return *y0, sol.ys[1][0], args["strength"]
 
-    numbers = jnp.array([0, 13, 19])
-    ends = jax.jit(jax.vmap(again))(numbers)
-    np.testing.assert_allclose(ends, paths.ys[1][numbers], rtol=1e-13)
+    p, q, ends, strength = jax.jit(jax.vmap(again))(jnp.arange(20))
+    np.testing.assert_allclose(q, np.sqrt(strength), rtol=1e-14)
+    np.testing.assert_allclose(paths.ys[0][:, 0], p, rtol=1e-14)
+    np.testing.assert_allclose(paths.ys[1], np.stack([q, ends], axis=1), rtol=1e-13)
+    assert len(np.unique(p)) == len(np.unique(q)) == 20
+
+
+def test_starts_and_terms_are_told_by_the_number_of_a_path():
+    given = TERMS, ds.StormerVerlet(), 0.0, END, 0.25, cloud, {"strength": 1.0}
+    paths = ds.ensemble(*given, key=jr.key(1), num_paths=20)
     # Beyond 32 bits, and in the types of 32 bits and fewer.
     far = 2**40 + 5
     for numbers in (jnp.array([5, far]), np.arange(5, 6, dtype=np.uint8)):

@@ -1,7 +1,6 @@
 """What `expectation` cannot do is refused with advice that fits."""
 
 import functools as ft
-import inspect
 
 import diffrax
 import jax
@@ -70,21 +69,6 @@ def test_only_the_key_of_a_path_is_replaced():
     assert new[1]["table"] is table
     np.testing.assert_array_equal(jr.key_data(new[0]), new[1]["old"])
     assert not np.array_equal(new[1]["old"], old)
-
-
-@pytest.mark.parametrize("function", [ds.expectation, ds.ensemble, ds.monte_carlo])
-def test_type_checkers_see_arguments_that_do_not_exist(function):
-    kinds = [x.kind for x in inspect.signature(function).parameters.values()]
-    assert not {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL} & {
-        *kinds
-    }
-
-
-@pytest.mark.parametrize("function", [ds.expectation, ds.ensemble])
-def test_whoever_looks_for_events_finds_monte_carlo(function):
-    paragraphs = function.__doc__.split("\n\n")
-    (events,) = [text for text in paragraphs if "vents" in text]
-    assert "diffrax_symplectic.monte_carlo" in events
 
 
 def test_times_between_steps_are_told_in_few_words_with_the_advice_first():
@@ -192,13 +176,3 @@ def test_a_function_of_spins_is_told_that_it_gets_a_pair():
     # What was left out is still told.
     with pytest.raises(TypeError, match="Was it left out"):
         mean(lambda t, y, args: args["size"] * ds.from_spinors(y)[2])
-
-
-def test_a_warning_of_failed_paths_names_temperature_and_friction():
-    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
-    terms = ds.langevin_terms(H0, 1.0, lambda t, q, args: -0.1 + 0 * q, ())
-    at = terms, ds.BAOAB(), 0, 0.2, 0.1, (jnp.array(0.0), jnp.array(1.0))
-    with pytest.warns(
-        UserWarning, match="`temperature` or `friction` that is negative"
-    ):
-        ds.ensemble(*at, key=jr.key(0), num_paths=4)

@@ -12,8 +12,6 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._simulation.levels import Combination, level_weights
 
-from ..drjit_here import needs_drjit
-
 
 KEY = jr.key(0)
 # <p q> of an oscillator with friction 0.01 at temperature 1, at t = 500 from (0, 2).
@@ -97,32 +95,20 @@ def _of_pendulum(**kwargs):
     return ds.expectation(phi, PENDULUM, ds.StormerVerlet(), 0, 1, y0=START, **kwargs)
 
 
-@pytest.mark.parametrize(
-    "how",
-    [
-        {},
-        dict(sampling=ds.ArrayRQMC(256, 8)),
-        dict(sampling=ds.IndependentPaths(4096)),
-        pytest.param(dict(engine="drjit"), marks=needs_drjit),
-    ],
-    ids=str,
-)
-def test_what_is_printed_after_the_mean_holds_the_error_of_the_step(how):
+def test_what_is_printed_after_the_mean_holds_the_error_of_the_step():
     # By four levels with steps half as long, 0.3640833476.
     exact = 0.3640833476
-    got = _of_pendulum(**how)
-    assert got.levels == 2 and abs(got.mean - exact) < 3 * got.error
+    got = _of_pendulum()
+    assert got.levels == 2 and abs(got.mean - exact) < got.error < 1e-4
     assert f"± {got.error:.1e} (sampling {got.std_error:.1e}, " in str(got)
     np.testing.assert_allclose(
         got.error, np.hypot(got.std_error, got.discretization_error)
     )
     low, high = got.interval(0.5)
     assert high - low > got.error
-    if not how:
-        # A step of 1/8 alone is off by 3e-4, and rounding is all that its samples show.
-        one = _of_pendulum(levels=1)
-        assert one.std_error < 1e-14 < 3e-4 < abs(one.mean - exact)
-        assert abs(got.mean - exact) < got.error < 1e-4
+    # A step of 1/8 alone is off by 3e-4, and rounding is all that its samples show.
+    one = _of_pendulum(levels=1)
+    assert one.std_error < 1e-14 < 3e-4 < abs(one.mean - exact)
 
 
 @pytest.mark.slow
@@ -207,34 +193,6 @@ def test_the_last_extrapolation_counts_as_one_of_the_first_power():
             factor * weights[Combination.EXTRAPOLATION],
             atol=1e-13,
         )
-
-
-@pytest.mark.parametrize(
-    "h, t1", [(0.5, 20), pytest.param(0.5, 50, marks=pytest.mark.slow)]
-)
-def test_levels_that_fit_the_order_by_chance_do_not_promise_too_much(h, t1):
-    # The phase of the longest steps is off by a radian, and each smaller step mends three
-    # quarters of that.
-    s = 0.2
-    energy = lambda t, p, q, args: (p**2 + q**2) / 2
-    terms = ds.hamiltonian_terms(energy, lambda t, p, q, args: -s * q, ())
-    square = lambda t, y, args: y[1] ** 2
-    got = ds.expectation(
-        square,
-        terms,
-        ds.ImplicitMidpoint(),
-        0,
-        t1,
-        h,
-        (jnp.array(0.0), jnp.array(1.0)),
-        key=KEY,
-        sampling=ds.ValueFunctions(degree=2, num_paths=64),
-        levels=4 if t1 == 50 else 5,
-    )
-    exact = np.cos(t1) ** 2 + s**2 * (t1 / 2 - np.sin(2 * t1) / 4)
-    assert not got.off_order
-    # The last extrapolation alone is 7 and 20 times less than this.
-    assert abs(got.mean - exact) < 1.5 * got.error
 
 
 def _uniform_unless(lost: float):

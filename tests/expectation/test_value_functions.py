@@ -147,14 +147,6 @@ def test_linear_systems_and_quadratic_functions_are_closed(dtype):
     assert max(map(np.max, jax.tree.leaves(got.std_error))) < rounding
 
 
-def test_degree_zero_is_plain():
-    got = _estimate(ds.ValueFunctions(0, 4000), KUBO, MIDPOINT, dt0=0.1)
-    square = (1 + _turned(2).real) / 2
-    fourth = 3 / 8 + _turned(2).real / 2 + _turned(4).real / 8
-    assert abs(got.mean - square) <= 4 * got.std_error
-    np.testing.assert_allclose(got.variance, fourth - square**2, rtol=0.1)
-
-
 def _harmonic(n: int, m: int):
     """A chain of oscillators with m constant noises."""
     share = np.sin(1.0 + np.arange(m)[:, None] * (1 + np.arange(n)))
@@ -165,30 +157,16 @@ def _harmonic(n: int, m: int):
     )
 
 
-@pytest.mark.parametrize("n, m", [(1, 5), (8, 2), (8, 6)])
+@pytest.mark.parametrize("n, m", [(1, 5), (8, 2)])
 @pytest.mark.slow
 def test_many_noises_and_many_dimensions_are_closed_where_they_can_be(n, m):
-    # 243 and 729 outcomes: by derivatives. 16 dimensions: by mean derivatives.
+    # 243 outcomes: by derivatives. 16 dimensions: by mean derivatives.
     terms, y0 = _harmonic(n, m), (jnp.zeros(n), jnp.ones(n))
     phi = lambda t, y, args: y[1] @ y[1]
     got = _estimate(ds.ValueFunctions(2, 256), terms, phi=phi, dt0=0.125, y0=y0)
     plain = _estimate(ds.IndependentPaths(20_000), terms, phi=phi, dt0=0.125, y0=y0)
     assert abs(got.mean - plain.mean) <= 4 * plain.std_error
     assert got.std_error < 1e-12
-
-
-@pytest.mark.slow
-def test_noise_that_enters_nonlinearly_leaves_the_mean_as_it_is():
-    H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
-    noise = lambda t, p, q, args: 0.5 * jnp.sin(q + jnp.arange(5.0))
-    terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((5,), KEY))
-    phi = lambda t, y, args: jnp.exp(y[0]) + y[1] ** 2
-    solver = ds.SRKw3("b")
-    got = _estimate(ds.ValueFunctions(4), terms, solver, phi, t1=0.4, dt0=0.4)
-    exact = ds.step_expectation(terms, solver, 0, 0.4, Y0, fn=phi)
-    assert abs(got.mean - exact) <= 4.5 * got.std_error
-    plain = _estimate(ds.IndependentPaths(4096), terms, solver, phi, t1=0.4, dt0=0.4)
-    assert got.std_error < plain.std_error / 3
 
 
 @pytest.mark.slow
@@ -302,20 +280,6 @@ def test_the_weights_of_a_mixture_have_mean_one_and_are_those_of_all_laws():
     np.testing.assert_array_equal(alone.weights(log_ratios), 1)
 
 
-@pytest.mark.slow
-def test_levels_extrapolate_and_the_bias_is_known_as_well_as_the_mean():
-    got = _estimate(ds.ValueFunctions(6), levels=3)
-    fine, finer = (
-        _estimate(ds.ValueFunctions(6), dt0=0.25 / 2**k, key=jr.key(k)) for k in (2, 5)
-    )
-    assert abs(got.mean + got.bias - fine.mean) <= 5 * np.hypot(
-        got.bias_std_error + got.std_error, fine.std_error
-    )
-    # The error of the finest step is nearly gone. What is left is said to be less.
-    assert abs(got.mean - finer.mean) < abs(got.bias) / 20
-    assert abs(got.mean - finer.mean) < got.error + 1e-5
-
-
 class _Counting(diffrax.AbstractSolver):
     """Moves by the number of steps that it remembers, and by the noise."""
 
@@ -343,32 +307,6 @@ def test_a_solver_that_remembers_steps_goes_on_with_its_own_state():
     got = _estimate(ds.ValueFunctions(1, 64), terms, solver, phi, y0=y0)
     np.testing.assert_allclose(got.mean, 0 + 1 + 2 + 3, atol=1e-12)
     assert got.std_error < 1e-12
-
-
-def test_paths_that_fail_are_counted_and_left_out():
-    # Kicks downwards in the first step are lost in the second.
-    def H0(t, p, q, args):
-        return jnp.where((t > 0.3) & (p < -0.1), jnp.nan, 0.0) * q + 0 * p
-
-    noise = lambda t, p, q, args: -q
-    terms = ds.hamiltonian_terms(H0, noise, WEAK, structure="separable")
-    got = _estimate(
-        ds.ValueFunctions(2, 600), terms, phi=lambda t, y, args: y[0], t1=0.5
-    )
-    assert got.num_paths + got.num_failed == 600 and 60 < got.num_failed < 140
-    assert np.isfinite(got.mean)
-
-
-def test_it_goes_on_where_it_stopped_and_stops_at_a_tolerance():
-    sampling = lambda n: ds.ValueFunctions(3, n, 64)
-    whole = _estimate(sampling(320))
-    rest = _estimate(sampling(320), start=_estimate(sampling(128)))
-    np.testing.assert_allclose(rest.mean, whole.mean, rtol=1e-13)
-    np.testing.assert_allclose(rest.std_error, whole.std_error, rtol=1e-9)
-    got = _estimate(sampling(10**6), tol=float(whole.std_error))
-    assert got.tol_reached and 200 < got.num_paths < 600
-    with pytest.raises(ValueError, match="was sampled by ValueFunctions"):
-        _estimate(ds.IndependentPaths(1000), start=whole)
 
 
 @pytest.mark.parametrize(
@@ -424,7 +362,7 @@ def test_from_an_interrupted_trial_nobody_is_told_to_go_on(monkeypatch):
     # The trials of a fit have batches of their own.
     monkeypatch.setattr(value_functions, "_comparison", interrupted)
     with pytest.raises(KeyboardInterrupt) as info:
-        _estimate(ds.ValueFunctions())
+        _estimate(ds.ValueFunctions(3, 128, 64))
     assert info.type is KeyboardInterrupt
 
 
@@ -465,6 +403,9 @@ def test_bad_input_is_told_what_to_pass():
         _estimate(ds.ValueFunctions(-1))
     with pytest.raises(ValueError, match="`num_paths` must be an integer, 2 or larger"):
         ds.ValueFunctions(2, 0)
+    fitted = _estimate(ds.ValueFunctions(3, 128, 64))
+    with pytest.raises(ValueError, match="was sampled by ValueFunctions"):
+        _estimate(ds.IndependentPaths(1000), start=fitted)
     with pytest.raises(ValueError, match="`sampling` must be an instance of"):
         _estimate(1000)
 

@@ -1,5 +1,6 @@
 """Every warning names the user's line, not one of the package."""
 
+import sys
 from collections.abc import Callable
 
 import diffrax
@@ -13,6 +14,11 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._expectation.fitted import basis_choice, value_functions
 
 from ..drjit_here import needs_drjit
+from .steps import problem_of
+
+
+# The function of the same name hides its module.
+EXPECTATION = sys.modules["diffrax_symplectic._expectation.expectation"]
 
 
 def here(call: Callable, message: str) -> None:
@@ -55,6 +61,41 @@ def test_of_the_loop_over_batches():
     here(lambda: ds.monte_carlo(same, key=KEY, num_paths=10), "samples are equal")
 
 
+def test_of_steps():
+    energy = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
+    terms = ds.langevin_terms(energy, 0.5, 1.0, ())
+    cosine = lambda t, y, args: jnp.cos(y[1])
+    given = cosine, terms, ds.BAOAB(), 0, 120, 8.0, ONE
+    here(lambda: ds.expectation(*given, key=KEY, sampling=FEW), "too long for `BAOAB`")
+
+
+def test_with_three_levels_fewer_looks_are_taken_and_with_one_none(monkeypatch):
+    def said(levels):
+        for name in looks:
+            monkeypatch.setattr(EXPECTATION, name, lambda *given, name=name: name)
+        if levels is None:
+            monkeypatch.setattr(EXPECTATION, "jumps_within_steps", lambda *given: None)
+        terms = ds.hamiltonian_terms(
+            lambda t, p, q, args: q, lambda t, p, q, args: q, ()
+        )
+        solver = ds.StormerVerlet()
+        problem = problem_of(terms, solver, 0.5, ONE, levels=levels or 2)
+        return {*EXPECTATION.messages_on_steps(problem, 0.5)}
+
+    on_three = {"jumps_within_steps", "too_long_steps"}
+    on_two = {
+        "unresolved_noise",
+        "unresolved_friction",
+        "jumps_at_step_ends",
+    } | on_three
+    looks = {"unresolved_drive"} | on_two
+    assert said(1) == set()
+    assert said(2) == on_two
+    assert said(3) == on_three
+    # Of a field that jumps nobody looks whether it changes too fast.
+    assert said(None) == looks - {"jumps_within_steps"}
+
+
 def test_of_rounding():
     y0 = jnp.ones(1, jnp.float32)
     path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((), jnp.float32), jr.key(0))
@@ -62,16 +103,12 @@ def test_of_rounding():
     here(mean(first, terms, y0), "Rounding errors may be larger")
 
 
-def test_of_the_law_where_phi_jumps():
-    weak = walk(lambda t, y, args: jnp.ones(1), ds.WeakBrownianPath((), jr.key(0)))
-    beyond = lambda t, y, args: (y[0] > 1.1).astype(float)
-    sampling = ds.IndependentPaths(20_000)
-    here(mean(beyond, weak, jnp.zeros(1), sampling), "changes by up to")
-
-
 def test_of_coordinates_to_sort_by():
     sampling = ds.ArrayRQMC(256, 2)
-    here(mean(first, GAUSSIAN, jnp.ones(8), sampling), "sorted by 8 coordinates")
+    here(
+        mean(first, GAUSSIAN, jnp.ones(8), sampling),
+        "sorted by 8 coordinates, which leaves 2.0",
+    )
 
 
 @pytest.mark.slow
@@ -81,6 +118,7 @@ def test_of_a_fit_that_takes_long(monkeypatch):
     here(mean(first, WEAK, jnp.ones(2), sampling), "The fit of `ValueFunctions`")
 
 
+@pytest.mark.slow
 def test_of_a_fit_that_is_no_better(monkeypatch):
     comparison = value_functions._comparison
 
@@ -103,7 +141,10 @@ def test_of_failed_paths():
     singular = lambda t, p, q, args: p**2 / 2 + jnp.sqrt(q)
     path = ds.FixedStepBrownianPath((), jr.key(0))
     terms = ds.hamiltonian_terms(singular, lambda t, p, q, args: 2 * q**2, path)
-    here(follow(terms, ds.StormerVerlet(), 4, 0.25), "of 60 paths failed")
+    here(
+        follow(terms, ds.StormerVerlet(), 4, 0.25),
+        "`temperature` or `friction` that is negative",
+    )
 
 
 def test_of_implicit_steps_without_a_solution():
@@ -112,7 +153,7 @@ def test_of_implicit_steps_without_a_solution():
     weak = lambda t, p, q, args: 0.01 * q
     terms = ds.hamiltonian_terms(explosive, weak, ())
     few = follow(terms, ds.ImplicitMidpoint(), 0.9, 0.9)
-    here(few, "an implicit step may have no solution")
+    here(few, "meet: pass a smaller `dt0`, or an explicit solver")
 
 
 @needs_drjit

@@ -1,5 +1,5 @@
-"""Random functions of one number, made of all that has once gone wrong in the fused engine,
-each in company of others.
+"""Random functions of one number, made of control flow and of all that has once gone wrong
+in the fused engine, each in company of others.
 
 The derivatives of these functions are of the size of one, and what they compare or convert
 to integers is not within rounding of another answer, for most numbers."""
@@ -14,7 +14,7 @@ from jax import lax
 
 
 PARTS = []
-# These functions take sines of angles that are too large for kernels: JAX gets such paths.
+# Sines of angles that are too large for kernels: JAX gets such paths.
 HANDED_BACK = []
 
 
@@ -33,9 +33,92 @@ def quarters(x):
     return jnp.floor(4 * lax.stop_gradient(x)).astype(jnp.int32)
 
 
-def sign_of(x):
-    """An infinite number for positive ones."""
-    return jnp.where(x > 0, jnp.inf, jnp.ones_like(x))
+# Control flow, with values from outside, constants and results that nothing needs
+
+
+def square(x):
+    return x * x
+
+
+def half(x):
+    return x / 2
+
+
+@part
+def values_from_outside(x):
+    y = jnp.sin(x)
+    z = 2 * x
+    a, b = lax.cond(x > 0, lambda: (y, z), lambda: (z, y))
+    return a * a / 2 + b / 4 + y * lax.cond(x > 0.2, square, lambda x: y, x) / 2
+
+
+@part
+def constants_of_branches(x):
+    one = lambda x: jnp.ones_like(x)
+    three_halves = lambda x: jnp.full_like(x, 1.5)
+    zero = lambda x: 0 * x
+    found = [lax.cond(x > 0, one, other, x) for other in (square, three_halves, zero)]
+    return x * sum(found) / 3
+
+
+@part
+def unused_results_and_branches(x):
+    three = lambda x: (x, x * x, x / 2)
+    others = lambda x: (x * x, jnp.exp(x), x)
+    a, _, b = lax.cond(x > 0, three, others, x)
+    known = lax.cond(jnp.zeros(()) < 1, square, half, x)
+    return (a + b) / 2 + lax.cond(x > 99, square, half, x) + known / 4
+
+
+@part
+def integers_and_masks_in_branches(x):
+    n = lax.cond(x > 0, lambda: jnp.int32(2), lambda: jnp.int32(1))
+    mask = lax.cond(x > 0, lambda x: x > 0.5, lambda x: jnp.array(True), x)
+    chosen = lax.switch(n, [jnp.negative, half, square], x)
+    return chosen * n / 2 + jnp.where(mask & ~(x > 0.8), x * x, half(x))
+
+
+@part
+def derivative_in_a_branch(x):
+    return lax.cond(x > 0, jax.grad(lambda x: x**3 / 3), jax.grad(half), x)
+
+
+@part
+def loops_with_values_from_outside(x):
+    y = jnp.sin(x)
+    swap = lambda i, y: (y[1], y[0] + y[1] / 9)
+    a, b = lax.fori_loop(0, 15, swap, (x, jnp.cos(x)))
+    return lax.fori_loop(0, 12, lambda i, z: y, x) + (a + b) / 9
+
+
+@part
+def loop_in_a_loop(x):
+    inner = lambda i, y: y / 2 + jnp.sin(x)
+    outer = lambda i, y: lax.fori_loop(0, 9, inner, y) / 3
+    return lax.fori_loop(0, 10, outer, x)
+
+
+@part
+def loop_of_unknown_length(x):
+    """The number is no function that JAX derives."""
+    going = lambda state: (state[0] > 0.1) & (state[1] < 9)
+    halved = lambda state: (state[0] / 2, state[1] + 1)
+    start = jnp.abs(lax.stop_gradient(x)), jnp.int32(0)
+    _, number = lax.while_loop(going, halved, start)
+    return x * x * (1 + number / 9)
+
+
+@part
+def window_of_a_table(x):
+    values = jnp.linspace(-1, 1, 7, dtype=x.dtype)
+    place = jnp.clip(jnp.floor(2 * x).astype(jnp.int32), 0, 4)
+    return jnp.sum(lax.dynamic_slice(values, (place,), (3,))) * x * x
+
+
+@part
+def largest_of_several(x):
+    y = jnp.stack([x, x * x, jnp.sin(2 * x)])
+    return jnp.max(y) / 2 + jnp.min(y) / 2 + jnp.argmax(y) * x / 2
 
 
 # Complex constants
@@ -49,13 +132,6 @@ def constant(value, x):
 def complex_constants_of_branches(x):
     same = constant(2 + 1j, x)
     return x * jnp.imag(lax.cond(x > 0.3, same, same) * (1 + 0.5j)) / 3
-
-
-@part
-def complex_constants_of_many_branches(x):
-    branches = [constant(value, x) for value in (1 + 0j, 1j, 2j)]
-    value = lax.switch(quarters(x) % 3, branches)
-    return x * jnp.real(value) + x * x * jnp.imag(value) / 3
 
 
 @part
@@ -86,109 +162,15 @@ def complex_loop(x):
 
 
 @handed_back
-def sine_of_a_large_angle(x):
-    return x * jnp.sin(3e9 * (quarters(x) > 2))
-
-
-@handed_back
-def sine_of_a_large_angle_in_a_branch(x):
-    large = lambda: jnp.cos(jnp.full_like(x, 1e10))
-    return x * lax.cond(x > 0.8, large, lambda: jnp.sin(x))
-
-
-@handed_back
 def sine_of_a_large_angle_in_a_loop(x):
     # The last angle is 1.2e10, for large numbers only.
     angle = lambda i: jnp.where(x > 0.8, 1e9 * i.astype(x.dtype), 1.0)
     return x * lax.fori_loop(0, 13, lambda i, y: y / 2 + jnp.sin(angle(i)), x)
 
 
-# Integers
-
-
-@part
-def integers_of_numbers_out_of_range(x):
-    n = (1e30 * lax.stop_gradient(x)).astype(jnp.int32)
-    return x * (n // 2**29) / 8
-
-
-@part
-def integers_of_nan(x):
-    n = (jnp.nan * lax.stop_gradient(x)).astype(jnp.int32)
-    return x * x * (1 + n)
-
-
-@part
-def unsigned_integers_of_negative_numbers(x):
-    n = (100 * jnp.floor(lax.stop_gradient(4 * x))).astype(jnp.uint8)
-    return x * n.astype(x.dtype) / 255
-
-
-@part
-def shifts_of_signed_integers(x):
-    n = lax.shift_right_logical(quarters(x), jnp.int32(28))
-    return x * n / 16 + x * (quarters(x) >> 1) / 4
-
-
-@part
-def shifts_of_unsigned_integers(x):
-    n = quarters(x).astype(jnp.uint32)
-    return x * (lax.shift_right_arithmetic(n, jnp.uint32(3)) & 3).astype(x.dtype) / 4
-
-
-@part
-def products_of_small_integers(x):
-    row = jnp.stack([quarters(x), quarters(2 * x)]).astype(jnp.int8) * 20
-    total = jnp.dot(row, row, preferred_element_type=jnp.int32)
-    return x * total / 9000
-
-
-# Zero times infinity
-
-
-@part
-def zero_times_infinity(x):
-    return jnp.where(jnp.isnan(0 * sign_of(x)), x / 2, x * x)
-
-
-@part
-def zero_times_infinity_in_a_product_of_matrices(x):
-    matrix = jnp.array([[0.0, 0.5], [0.5, 0.3]], x.dtype)
-    first, second = matrix @ jnp.stack([sign_of(x), x])
-    return jnp.where(jnp.isnan(first), x * x, first) + jnp.where(x > 0, x, second) / 3
-
-
-# Empty arrays
-
-
-@part
-def empty_arrays(x):
-    none = jnp.stack([x])[:0]
-    return x * (1 + jnp.sum(none * 2)) + jnp.where(jnp.all(none > 0), x * x, 0)
-
-
 # Tables
 
 TABLE = np.sin(np.arange(200.0))
-COMPLEX_TABLE = np.exp(0.3j * np.arange(100))
-
-
-@part
-def table_at_small_indices(x):
-    table = jnp.asarray(TABLE, x.dtype)
-    return x * table[quarters(x).astype(jnp.int8)] + x * table[199 - quarters(x)] / 2
-
-
-@part
-def table_at_small_indices_without_sign(x):
-    place = (60 + quarters(x)).astype(jnp.uint8)
-    return x * jnp.sum(lax.dynamic_slice(jnp.asarray(TABLE, x.dtype), (place,), (2,)))
-
-
-@part
-def complex_table(x):
-    table = jnp.asarray(COMPLEX_TABLE, jnp.result_type(x, jnp.complex64))
-    return jnp.real(table[10 + quarters(x)] * lax.complex(x, x * x))
 
 
 @part
@@ -196,6 +178,14 @@ def table_in_a_branch(x):
     table = jnp.asarray(TABLE, x.dtype)
     read = lambda table: x * table[50 + quarters(x)]
     return lax.cond(x > 0, read, lambda table: x * table[3], table)
+
+
+@part
+def shifts_of_integers(x):
+    signed = lax.shift_right_logical(quarters(x), jnp.int32(28)) / 16
+    n = quarters(x).astype(jnp.uint32)
+    other = lax.shift_right_arithmetic(n, jnp.uint32(3)) & 3
+    return x * (signed + other.astype(x.dtype)) / 4
 
 
 # Linear systems and sorting
@@ -211,11 +201,6 @@ def linear_system(x):
 @part
 def median(x):
     return jnp.median(jnp.stack([x, x * x, jnp.sin(3 * x)]))
-
-
-@part
-def smooth(x):
-    return jnp.tanh(x) + jnp.exp(-x * x) / 3
 
 
 # What the parts stand in

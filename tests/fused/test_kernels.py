@@ -68,7 +68,7 @@ expected = [{position(k)} for k in range(4)]
 found = {}
 
 def several(k):
-    found[k] = {position(k) for _ in range(100)}
+    found[k] = {position(k) for _ in range(25)}
 
 # Threads change as often as Python allows.
 sys.setswitchinterval(1e-6)
