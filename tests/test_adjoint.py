@@ -207,7 +207,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("name", slow_except(["times"], CASES))
+@pytest.mark.parametrize("name", slow_except(["backward"], CASES))
 def test_gradients_are_those_of_checkpointing(name):
     solver, noise, saveat, options = CASES[name]
     got, expected = gradients(solver, noise, saveat, **options)
@@ -249,6 +249,7 @@ def test_memory_does_not_grow_with_steps():
     np.testing.assert_allclose(compiled(args, y0, t1), change, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_way_back_that_is_lost_is_reported_for_that_path_alone():
     # Away from an unstable equilibrium, rounding errors grow by exp(2 t rate) on the walk.
     def end(q0, rate, checkpoints, throw):

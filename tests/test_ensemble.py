@@ -281,6 +281,7 @@ def test_arrays_of_the_state_may_be_empty():
     np.testing.assert_allclose(fused.ys[1]["a"], plain.ys[1]["a"], rtol=1e-13)
 
 
+@pytest.mark.slow
 @needs_drjit
 def test_paths_whose_angles_are_too_large_for_the_kernel_are_taken_by_jax():
     def driven(t, p, q, args):

@@ -292,6 +292,7 @@ def _ends_with(code: str) -> subprocess.CompletedProcess:
 # function that is named can go as soon as `pyproject.toml` asks for that version.
 
 
+@pytest.mark.slow
 @needs_llvm
 def test_drjit_writes_the_result_of_a_conditional_into_what_its_branch_returned():
     # So `_stablehlo.tensor.copied_entries` copies what a branch returns.
@@ -305,6 +306,7 @@ def test_drjit_writes_the_result_of_a_conditional_into_what_its_branch_returned(
     assert done.stdout.split("\n")[0] == "[1, -6, 9]", done.stderr
 
 
+@pytest.mark.slow
 @needs_llvm
 def test_drjit_returns_the_constant_of_a_branch_from_a_conditional():
     # So `_stablehlo.tensor.as_own_literal` makes constants anew.

@@ -143,8 +143,15 @@ def test_programs_work_under_transformations():
     assert by_k(jnp.array(1.0)) == 2
 
 
-def test_programs_are_dropped_with_all_that_uses_them():
-    gc.collect()
+@pytest.fixture
+def only_new_garbage():
+    """To look through all that other tests left takes seconds."""
+    gc.freeze()
+    yield
+    gc.unfreeze()
+
+
+def test_programs_are_dropped_with_all_that_uses_them(only_new_garbage):
     before = len(_programs._known)
     program = traced(lambda x: jnp.sinh(jnp.cosh(x)), ONE)
     assert len(_programs._known) == before + 1
@@ -153,7 +160,7 @@ def test_programs_are_dropped_with_all_that_uses_them():
     assert len(_programs._known) == before
 
 
-def test_the_number_of_compiled_programs_has_a_bound(monkeypatch):
+def test_the_number_of_compiled_programs_has_a_bound(monkeypatch, only_new_garbage):
     few = _programs._Remembered(2)
     monkeypatch.setattr(_programs, "_programs", few)
     apply = compiled(lambda program, x: program(x))

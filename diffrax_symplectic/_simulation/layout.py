@@ -52,20 +52,20 @@ class Layout(NamedTuple):
     def labels(self, ts: np.ndarray | None) -> list[str]:
         """The time, of `ts`, and the place in the PyTree of each number, such as `t=2,
         ['energy'][0]`; the empty string for a single number."""
-        places = []
         tree = self.treedef.unflatten([np.zeros(shape) for shape in self.shapes])
-        for path, leaf in jtu.tree_leaves_with_path(tree):
-            for index in np.ndindex(leaf.shape):
-                entry = f"[{', '.join(map(str, index))}]" if index else ""
-                places.append(jtu.keystr(path) + entry)
-        if self.num_times is None:
-            return places
-        times = [f"[{k}]" for k in range(self.num_times)]
-        if ts is not None:
-            times = [f"t={t:.7g}" for t in ts]
-        return [
-            f"{time}, {place}" if place else time for time in times for place in places
-        ]
+        labels = []
+        for k in range(1 if self.num_times is None else self.num_times):
+            for path, leaf in jtu.tree_leaves_with_path(tree):
+                for index in np.ndindex(leaf.shape):
+                    time = ""
+                    if ts is not None:
+                        time = f"t={ts[k]:.7g}"
+                    elif self.num_times is not None:
+                        index = k, *index
+                    entry = f"[{', '.join(map(str, index))}]" if index else ""
+                    place = jtu.keystr(path) + entry
+                    labels.append(", ".join(filter(None, (time, place))))
+        return labels
 
 
 def as_vectors(

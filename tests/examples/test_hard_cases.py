@@ -74,8 +74,6 @@ def test_escape_from_a_double_well_costs_the_energy_that_noise_brings():
     assert balance.std_error <= 0.02 * -bottom
 
 
-
-
 def test_the_law_of_rods_is_the_volume_of_the_momenta_that_they_allow():
     # The root of det(J J^T), with the gradients J of the constraints, by definition.
     for key in jr.split(jr.key(0), 5):

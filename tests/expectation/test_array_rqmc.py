@@ -19,6 +19,7 @@ from diffrax_symplectic._expectation.sorted.array_rqmc import word_layout
 from diffrax_symplectic._simulation import loop
 from diffrax_symplectic._simulation.levels import level_weights
 
+from ..families import slow_except
 from ..problems import kubo_terms
 
 
@@ -358,7 +359,10 @@ def test_a_path_fails_by_its_result_its_state_or_its_phi(by):
     np.testing.assert_allclose(got.mean, 1.0)
 
 
-@pytest.mark.parametrize("solver", [ds.StormerVerlet(), diffrax.Heun()])
+EXPLICIT = ds.StormerVerlet(), diffrax.Heun()
+
+
+@pytest.mark.parametrize("solver", slow_except(EXPLICIT[:1], EXPLICIT))
 def test_a_shape_stands_for_the_path_that_the_solver_needs(solver):
     H0 = lambda t, p, q, args: (p**2 + q**2) / 2
     noise = lambda t, p, q, args: 0.3 * q

@@ -66,10 +66,11 @@ RUNS = {
     "IndependentPaths": (mean, dict(sampling=ds.IndependentPaths(64)), None),
     "IndependentPaths, fused": fused(mean, dict(sampling=ds.IndependentPaths(64))),
     "ArrayRQMC": (mean, dict(sampling=ds.ArrayRQMC(64, 2)), None),
-    "ValueFunctions": (
+    "ValueFunctions": pytest.param(
         mean,
         dict(sampling=ds.ValueFunctions(degree=2, num_paths=64)),
         None,
+        marks=pytest.mark.slow,
     ),
     "ensemble": (ds.ensemble, dict(num_paths=64), None),
     "ensemble, fused": fused(ds.ensemble, dict(num_paths=64)),

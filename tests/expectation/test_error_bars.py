@@ -146,8 +146,6 @@ def test_a_control_whose_mean_is_not_zero_is_dropped():
     assert not list(cautions(fine, None, ""))
 
 
-
-
 # Fewer paths, steps and fits than there, for less time.
 _FEW = {
     "IndependentPaths": ds.IndependentPaths(1024),

@@ -41,6 +41,7 @@ def test_other_samplings_and_engines_are_refused():
         mean(engine="numba")
 
 
+@pytest.mark.slow
 @needs_drjit
 def test_a_path_that_fails_has_no_part_in_a_mean():
     terms = ds.hamiltonian_terms(

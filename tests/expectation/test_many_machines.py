@@ -104,7 +104,7 @@ def test_parts_that_do_not_fit_are_refused(tmp_path):
     with pytest.raises(ValueError, match="over 32 paths.*over 64.*same `sampling`"):
         _part("ArrayRQMC", 4, start=smaller)
     with pytest.raises(ValueError, match="were sampled by IndependentPaths"):
-        one.merge(_part("ValueFunctions", 32, 32))
+        one.merge(dataclasses.replace(next_, sampling=SAMPLINGS["ValueFunctions"](32)))
     with pytest.raises(ValueError, match="`merge` takes estimates; got 3"):
         one.merge(3)  # pyright: ignore
     with pytest.raises(ValueError, match="`first` must be an integer from 0 to"):

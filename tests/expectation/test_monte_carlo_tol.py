@@ -87,6 +87,10 @@ def test_levels_of_a_sample_share_its_key_and_go_on_where_they_stopped():
     np.testing.assert_allclose(got.bias, 0.05 * one.mean, rtol=1e-12)
     np.testing.assert_allclose(got.bias_std_error, 0.05 * one.std_error, rtol=1e-12)
     np.testing.assert_allclose(got.error, np.hypot(got.std_error, got.bias))
+    parts = (
+        f"(sampling {got.std_error:.1e}, discretization {got.discretization_error:.1e})"
+    )
+    assert f"± {got.error:.1e} {parts}" in str(got)
     rest = run(1000, start=run(300))
     np.testing.assert_allclose(rest.mean, got.mean, rtol=1e-12)
     np.testing.assert_allclose(rest.bias, got.bias, rtol=1e-11)

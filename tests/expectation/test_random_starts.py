@@ -175,6 +175,7 @@ def test_a_function_in_args_is_told_from_a_function_of_the_key():
         mean(SAMPLINGS[0], y0=lambda: ONE)
 
 
+@pytest.mark.slow
 def test_starts_take_args_by_any_name_and_options_by_their_defaults():
     def of_key(key, width=WIDTH):
         return jnp.zeros(()), width * jr.normal(key)

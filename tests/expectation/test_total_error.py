@@ -12,6 +12,8 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._simulation.levels import Combination, level_weights
 
+from ..families import slow_except
+
 
 KEY = jr.key(0)
 # <p q> of an oscillator with friction 0.01 at temperature 1, at t = 500 from (0, 2).
@@ -95,6 +97,7 @@ def _of_pendulum(**kwargs):
     return ds.expectation(phi, PENDULUM, ds.StormerVerlet(), 0, 1, y0=START, **kwargs)
 
 
+@pytest.mark.slow
 def test_what_is_printed_after_the_mean_holds_the_error_of_the_step():
     # By four levels with steps half as long, 0.3640833476.
     exact = 0.3640833476
@@ -229,9 +232,12 @@ def _added(path):
     return diffrax.MultiTerm(diffrax.ODETerm(lost), kick)
 
 
+SAMPLINGS = ds.IndependentPaths(4000), ds.ArrayRQMC(256, 16), ds.ValueFunctions(1, 2000)
+
+
 @pytest.mark.parametrize(
     "sampling",
-    [ds.IndependentPaths(4000), ds.ArrayRQMC(256, 16), ds.ValueFunctions(1, 2000)],
+    slow_except(SAMPLINGS[:2], SAMPLINGS),
     ids=lambda sampling: type(sampling).__name__,
 )
 def test_failed_paths_count_by_the_spread_of_paths_in_every_sampling(sampling):

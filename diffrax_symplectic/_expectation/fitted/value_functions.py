@@ -132,7 +132,9 @@ class ValueFunctions(AbstractSampling):
                 "used. Pass another `degree`, or another `sampling`.",
                 stacklevel=_FRAMES_TO_USER,
             )
-        if not np.any(choice.used):
+        # Where paths fail, those of other laws fail far more often.
+        some_fail = any(trial.num_failed > 0 for trial in trials_of_candidates)
+        if some_fail or not np.any(choice.used):
             mixture = mixture.own_law_alone()
         return plan_for(choice, mixture, self.num_paths)._replace(
             is_fit_quick=is_quick(chosen),
