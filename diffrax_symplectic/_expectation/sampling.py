@@ -5,8 +5,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
-import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Int, PRNGKeyArray
 
 from .._custom_types import Devices
 from .._simulation import Layout, Problem
@@ -34,11 +33,12 @@ class Averaged(NamedTuple):
         minus `value`.
     """
 
-    value: Float[Array | np.ndarray, "..."]
-    heaviness: Float[Array | np.ndarray, "..."] | None = None
-    largest: Float[Array | np.ndarray, "..."] | None = None
-    plain: Float[Array | np.ndarray, "..."] | None = None
-    control: Float[Array | np.ndarray, "..."] | None = None
+    # Arrays of JAX, or of NumPy on the host.
+    value: Any
+    heaviness: Any = None
+    largest: Any = None
+    plain: Any = None
+    control: Any = None
 
     @property
     def fields(self) -> dict[str, Any]:

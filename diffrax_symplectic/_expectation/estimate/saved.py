@@ -163,7 +163,8 @@ def fields_from(contents: Contents) -> dict[str, Any]:
         numbers: Any = dict(zip(_NUMBERS, values))
         # JSON has lists only.
         numbers["failed_on"] = tuple(numbers["failed_on"])
-        return Moments(**numbers, **{name: averaged(name, batch) for name in _AVERAGED})
+        arrays_of_batch: Any = {name: averaged(name, batch) for name in _AVERAGED}
+        return Moments(**numbers, **arrays_of_batch)
 
     moments = [moments_of_batch(*of_batch) for of_batch in enumerate(header["ranges"])]
     fields = {name: header[name] for name in _FIELDS_OF_ESTIMATE}

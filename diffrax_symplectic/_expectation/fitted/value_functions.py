@@ -64,6 +64,11 @@ class ValueFunctions(AbstractSampling):
     averaged derivatives. If a step has more than 100 outcomes (five noises or more), the
     control variate is built from first and second derivatives along the noise.
 
+    Half of the paths draw wider noise, or for one or two noises such as pushes to one side,
+    and are weighted by their likelihood ratios. So rare paths, where a fit may be poor, are
+    a part of the estimate and of its standard error. (Where paths fail, or no fit is used,
+    all paths draw the noise as it is.)
+
     In a few dimensions, standard errors are $10^{-4}$ to $10^{-8}$ times those of as many
     independent paths, if $\phi$ is smooth and times are [not too
     long](expectation.md#where-valuefunctions-gains).
@@ -79,7 +84,8 @@ class ValueFunctions(AbstractSampling):
 
     **Source:** the regression-based control variates of [Belomestny and others
     (2015)](https://doi.org/10.48550/arXiv.1510.03141), for weak schemes of [Belomestny,
-    Häfner and Urusov (2016)](https://doi.org/10.48550/arXiv.1612.05255).
+    Häfner and Urusov (2016)](https://doi.org/10.48550/arXiv.1612.05255); the defensive
+    mixture of [Hesterberg (1995)](https://doi.org/10.1080/00401706.1995.10484303).
     """
 
     degree: int | None = None
@@ -132,7 +138,7 @@ class ValueFunctions(AbstractSampling):
                 "used. Pass another `degree`, or another `sampling`.",
                 stacklevel=_FRAMES_TO_USER,
             )
-        # Where paths fail, those of other laws fail far more often.
+        # Where paths fail, those of wider laws fail far more often, and tell nothing.
         some_fail = any(trial.num_failed > 0 for trial in trials_of_candidates)
         if some_fail or not np.any(choice.used):
             mixture = mixture.own_law_alone()
