@@ -34,9 +34,9 @@ class Layout(NamedTuple):
         size_of_phi = sum(map(math.prod, self.shapes))
         return size_of_phi * (1 if self.num_times is None else self.num_times)
 
-    def unravel(self, x: Float[Array | np.ndarray, "*axes size"]) -> PyTree[Array]:
-        """The PyTree of the numbers in a vector. Each array has the other axes of `x` in
-        front."""
+    def unravel(self, x: Float[Array | np.ndarray, "*axes size"]) -> Any:
+        """The PyTree of the numbers in a vector. Each of its arrays has the other axes of
+        `x` in front."""
         axes = x.shape[:-1]
         if self.num_times is not None:
             axes = (*axes, self.num_times)

@@ -59,8 +59,8 @@ class Mixture(eqx.Module):
     """
 
     shares: Float[Array | np.ndarray, " laws"]
-    cuts_of_laws: UInt32[Array | np.ndarray, "1 laws-1"]
-    cuts: UInt32[Array | np.ndarray, "levels laws n outcomes-1"]
+    cuts_of_laws: UInt32[Array | np.ndarray, "1 cuts_of_laws"]
+    cuts: UInt32[Array | np.ndarray, "levels laws n cuts"]
     log_ratios: Float[Array | np.ndarray, "levels laws n outcomes"]
 
     @staticmethod

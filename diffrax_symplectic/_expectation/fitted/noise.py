@@ -99,7 +99,7 @@ class Noise(eqx.Module):
         self,
         key: PRNGKeyArray,
         draw_index: Any,
-        cuts: UInt32[Array | np.ndarray, "n outcomes-1"],
+        cuts: UInt32[Array | np.ndarray, "n cuts"],
     ) -> tuple[Float[Array, " n"], Bool[Array, "n outcomes"]]:
         """The variables `x` drawn from the key and this index, and which outcomes they
         have. The number of the outcome of a variable is the number of its `cuts`, as from
@@ -263,7 +263,7 @@ def _hidden_if_result(x: Array) -> Array:
     return jax.lax.optimization_barrier(x) if is_result else x
 
 
-def cuts_of(laws: Sequence[Discrete]) -> UInt32[np.ndarray, "n outcomes-1"]:
+def cuts_of(laws: Sequence[Discrete]) -> UInt32[np.ndarray, "n cuts"]:
     """The cuts between the random words of the outcomes of variables with these laws, by
     which a `WeakBrownianPath` draws, too."""
     return _padded_cuts([np.array(law.cuts, float) for law in laws])
@@ -271,12 +271,12 @@ def cuts_of(laws: Sequence[Discrete]) -> UInt32[np.ndarray, "n outcomes-1"]:
 
 def cuts_by(
     probabilities: Sequence[Float[np.ndarray, " outcomes"]],
-) -> UInt32[np.ndarray, "n outcomes-1"]:
+) -> UInt32[np.ndarray, "n cuts"]:
     """The cuts for the probabilities of the outcomes of each variable."""
     return _padded_cuts([np.cumsum(p)[:-1] * 2.0**32 for p in probabilities])
 
 
-def _padded_cuts(rows: Sequence[np.ndarray]) -> UInt32[np.ndarray, "n outcomes-1"]:
+def _padded_cuts(rows: Sequence[np.ndarray]) -> UInt32[np.ndarray, "n cuts"]:
     most = max(map(len, rows))
     # Words are whole numbers, and none is above this one.
     last = np.iinfo(np.uint32).max
