@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Key, PRNGKeyArray, PyTree
 
 from ._arguments import (
     check_memory,
@@ -66,7 +66,7 @@ class PathResults(NamedTuple):
 
 
 # Solves for the paths with these keys, by this step size.
-_SolveBatch: TypeAlias = Callable[[PRNGKeyArray, Array], PathResults]
+_SolveBatch: TypeAlias = Callable[[Key[Array, " num_paths"], Array], PathResults]
 
 
 class _MeasuredError(NamedTuple):
@@ -259,7 +259,7 @@ class _ComparedSystem(NamedTuple):
         """Whether errors are those of paths, rather than of means."""
         return self.phi is None
 
-    def keys(self, batch_number: int) -> PRNGKeyArray:
+    def keys(self, batch_number: int) -> Key[Array, " num_paths"]:
         """The keys of the paths of a batch."""
         return jr.split(jr.fold_in(self.key, batch_number), self.num_paths)
 

@@ -120,7 +120,7 @@ class Suggestion:
 
     solver: AbstractSymplecticSolver
     weak_order: int
-    strong_order: float | None
+    strong_order: int | float | None
     path: str
     reason: str
     terms: Callable[[PRNGKeyArray], diffrax.AbstractTerm] = dataclasses.field(

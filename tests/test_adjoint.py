@@ -216,6 +216,7 @@ def test_gradients_are_those_of_checkpointing(name):
         np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
+@pytest.mark.core
 @pytest.mark.slow
 def test_gradients_in_single_precision_of_a_part_of_the_state_are_those_of_checkpointing():
     saveat, dtype = diffrax.SaveAt(ts=SAVED.astype(jnp.float32)), jnp.float32

@@ -20,6 +20,7 @@ def _terms():
     return ds.hamiltonian_terms(H0, lambda t, p, q, args: -q, path)
 
 
+@pytest.mark.core
 def test_strong_errors_are_of_the_order_of_the_solver():
     solvers = [ds.StormerVerlet(), ds.SRKw5()]
     result = ds.compare_solvers(

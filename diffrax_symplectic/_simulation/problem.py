@@ -329,7 +329,7 @@ class Problem(eqx.Module):
         success = diffrax.is_okay(result) & all_finite(y)
         return y, eqx.filter(whole_state, eqx.is_array), success
 
-    def variables(self, h: Float[Array | np.ndarray, ""]) -> StepVariables:
+    def variables(self, h: RealScalarLike) -> StepVariables:
         """The random variables of a step of this size."""
         return step_variables(self.terms, h, self.motion_numbers)
 

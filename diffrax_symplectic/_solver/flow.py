@@ -101,7 +101,7 @@ def check_returns_pair(
         )
 
 
-def _structure_of(y: Y) -> PyTree:
+def _structure_of(y: PyTree) -> PyTree:
     """The structure of a state, and the shapes and dtypes of its leaves."""
     leaves, treedef = jtu.tree_flatten(y)
     return treedef, [(jnp.shape(x), jnp.result_type(x)) for x in leaves]

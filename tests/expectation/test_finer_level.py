@@ -45,6 +45,7 @@ def _energy_of_comet(eccentricity, steps_per_orbit, **options):
     return abs(got.mean - exact) / got.error, message
 
 
+@pytest.mark.core
 def test_a_close_encounter_that_steps_miss_is_told_once():
     bars, message = _energy_of_comet(0.9, 30)
     assert bars > 5

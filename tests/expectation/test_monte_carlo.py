@@ -74,6 +74,7 @@ def test_the_mean_of_a_constant_in_single_precision_is_that_constant():
     np.testing.assert_allclose(got.std_error, np.finfo(np.float32).eps / 3)
 
 
+@pytest.mark.core
 def test_an_estimate_can_be_continued():
     key = jr.key(2)
     first = ds.monte_carlo(_normal, key=key, num_paths=300, batch_size=128)
@@ -147,6 +148,7 @@ def _square(solver, steps=10):
     return phi
 
 
+@pytest.mark.core
 def test_the_estimate_of_a_solve_is_its_exact_expectation():
     # A step turns by 2 atan((h + I) / 2): the moments of the method in closed form.
     n, h = 10, 0.1

@@ -235,6 +235,7 @@ def _added(path):
 SAMPLINGS = ds.IndependentPaths(4000), ds.ArrayRQMC(256, 16), ds.ValueFunctions(1, 2000)
 
 
+@pytest.mark.core
 @pytest.mark.parametrize(
     "sampling",
     slow_except(SAMPLINGS[:2], SAMPLINGS),

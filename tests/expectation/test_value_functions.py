@@ -252,6 +252,7 @@ def test_wider_noise_knows_its_likelihood_and_its_entropy():
         assert mean[0] > 0.2 > -0.2 > mean[1] if law == 4 else np.allclose(mean, 0)
 
 
+@pytest.mark.core
 def test_the_weights_of_a_mixture_have_mean_one_and_are_those_of_all_laws():
     problem = Problem.of(SQUARE, PENDULUM, VERLET, 0, 1, 0.25, Y0, None, None, 2)
     mixture = Mixture.of(problem)

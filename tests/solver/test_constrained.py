@@ -420,6 +420,7 @@ def _errors_of_gibbs(solver, h, slow=False):
     return np.max(abs(found[3:, 3:] - exact)), np.max(abs(found[:3, 3:]))
 
 
+@pytest.mark.core
 def test_kicked_positions_in_a_harmonic_well_and_a_plane_have_the_law_of_gibbs():
     assert max(_errors_of_gibbs(ds.BAOAB(), 0.5)) < 1e-13
 

@@ -121,6 +121,7 @@ def test_what_a_solver_remembers_is_not_taken_for_where_the_flow_leads():
     np.testing.assert_allclose([x[-1] for x in sol.ys], y, atol=1e-13)
 
 
+@pytest.mark.core
 def test_steps_of_a_reversible_solver_are_undone():
     solver = ds.LinearFlow(ds.StormerVerlet(), waves(8, 0.1))
     assert _undoes_its_steps(solver)

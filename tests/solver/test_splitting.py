@@ -67,6 +67,7 @@ def test_the_solvers_with_names_are_their_pieces(pieces, named, options):
     assert pieces.stage_vectors(1) == named.stage_vectors(1)
 
 
+@pytest.mark.core
 def test_a_rod_is_kept_by_any_order_of_the_pieces():
     rod = lambda q, args: jnp.sum(q**2, keepdims=True) - 1
     y0 = jnp.zeros(3), jnp.array([0.6, 0.0, -0.8])

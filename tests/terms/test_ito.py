@@ -76,6 +76,7 @@ def test_a_drift_of_correction_holds_no_noise_and_no_structure():
     assert not is_hamiltonian(correction)
 
 
+@pytest.mark.core
 def test_steps_are_those_of_an_ito_solver():
     # Milstein's two schemes differ by the correction alone.
     drift = lambda t, y, args: jnp.sin(y)

@@ -31,6 +31,7 @@ def _site_noise(t, psi, args):
     return jnp.stack([jnp.sum(jnp.abs(psi) ** 4), jnp.sum(psi.real * psi.imag)])
 
 
+@pytest.mark.core
 def test_solutions_push_forward_to_the_equation_of_amplitudes():
     psi, args, W = _random(jr.key(0)), 1.2 - 0.4j, jnp.array([0.3, -0.7])
     drift, diffusion = ds.wave_terms(_lattice, _site_noise, weak_path(2)).terms

@@ -126,7 +126,8 @@ class Mixture(eqx.Module):
 
 
 def log_ratios_of_outcomes(
-    log_ratios: Float[Array, "laws n outcomes"], has_outcome: Bool[Array, "n outcomes"]
+    log_ratios: Float[Array | np.ndarray, "laws n outcomes"],
+    has_outcome: Bool[Array, "n outcomes"],
 ) -> Float[Array, " laws"]:
     """The logarithms of the probabilities of a step's outcomes by each law, divided by
     those by the own law."""
