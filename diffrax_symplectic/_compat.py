@@ -1,8 +1,9 @@
 """What this package uses of others that they do not promise to keep, by its use.
 
 Some of it is private, some is public but undocumented, and some is how a class happens to
-store what it was given. It is used nowhere else, and `tests/test_private_parts.py` tests
-each part by itself: if one of these tests fails after an upgrade, change the function here.
+store what it was given. It is used nowhere else. If a test of it in
+`tests/test_private_parts.py`, or of what uses it, fails after an upgrade, change the
+function here.
 (What operations of MLIR tell is read in `_stablehlo/mlir.py`, in the same way.)
 """
 
