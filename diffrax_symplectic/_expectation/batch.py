@@ -33,6 +33,7 @@ class BatchMoments(NamedTuple):
     - `num_failed`: the number of failed paths. A path that fails on several levels counts
         once.
     - `failed_on`: the number of paths that failed on each level.
+    - `any_failed`: whether any path failed, counted or not.
     - `mean`: the mean of the good samples.
     - `mean_correction`: what rounding took from this mean. It is added in float64.
     - `norm`: the root of the sum of squared deviations from the exact mean.
@@ -43,6 +44,7 @@ class BatchMoments(NamedTuple):
     num_good: Int[Array, "*devices"]
     num_failed: Int[Array, "*devices"]
     failed_on: Int[Array, "*devices levels"]
+    any_failed: Bool[Array, "*devices"]
     mean: Averaged
     mean_correction: Averaged
     norm: Averaged
@@ -132,6 +134,9 @@ def _moments_on_device(
     # (levels, samples)
     failures = jnp.where(is_wanted, samples.num_failed, 0)
     num_failed_on_any = jnp.sum(jnp.max(failures, axis=0))
+    any_failed = num_failed_on_any > 0
+    if samples.also_failed is not None:
+        any_failed |= jnp.any(samples.also_failed & is_wanted)
     fields = samples.averaged.fields
     # All fields are summed at once, since fewer operations compile sooner.
     moments = _moments_of_fields(jnp.stack([*fields.values()]), good)
@@ -143,6 +148,7 @@ def _moments_on_device(
         num_good=jnp.sum(good),
         num_failed=num_failed_on_any,
         failed_on=jnp.sum(failures, axis=1),
+        any_failed=any_failed,
         **averaged_moments,
     )
 

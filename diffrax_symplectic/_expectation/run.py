@@ -232,7 +232,7 @@ class _Batches:
         # The moments are traced if a function closes over traced values.
         check_untraced("`expectation` or `monte_carlo`", running_batch.moments)
         arrays = jax.device_get(running_batch.moments)
-        if not running_batch.has_newton and np.any(arrays.num_failed > 0):
+        if not running_batch.has_newton and np.any(arrays.any_failed):
             self._sampler = self._sampler_with_newton
             again = self.start(running_batch.first, running_batch.end)
             arrays = jax.device_get(again.moments)

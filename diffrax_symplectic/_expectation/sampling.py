@@ -58,11 +58,14 @@ class Samples(eqx.Module):
         all numbers of `phi`.
     - `good`: which samples are good.
     - `num_failed`: how many paths failed in each, on each level.
+    - `also_failed`: which samples have a path that failed, but is not counted; `None` if
+        there are none.
     """
 
     averaged: Averaged
     good: Bool[Array, " n"]
     num_failed: Int[Array, "levels n"] | Bool[Array, "levels n"]
+    also_failed: Bool[Array, " n"] | None = None
 
 
 class Outputs(NamedTuple):

@@ -22,6 +22,13 @@ from diffrax_symplectic._expectation.fitted.mixture import (
     Mixture,
 )
 from diffrax_symplectic._expectation.fitted.noise import Noise
+from diffrax_symplectic._expectation.run import run
+from diffrax_symplectic._expectation.sampling import (
+    Averaged,
+    Outputs,
+    Samples,
+    SamplingPlan,
+)
 from diffrax_symplectic._simulation.levels import Combination
 from diffrax_symplectic._simulation.problem import Problem
 from diffrax_symplectic._terms import outcomes, step_variables
@@ -300,6 +307,43 @@ class _Counting(diffrax.AbstractSolver):
         y1 = y0 + solver_state + terms.contr(t0, t1)
         ok = diffrax.RESULTS.successful
         return y1, None, dict(y0=y0, y1=y1), solver_state + 1, ok
+
+
+def test_paths_that_fail_by_another_law_alone_are_reported_and_do_not_count():
+    # The own law leads here once in ten thousand paths, a push upward often.
+    lost = lambda t, y, args: jnp.where(y > 3.3, jnp.nan, 0.0)
+    kick = diffrax.ControlTerm(lambda t, y, args: jnp.ones(()), WEAK)
+    terms = diffrax.MultiTerm(diffrax.ODETerm(lost), kick)
+    phi = lambda t, y, args: y
+    problem = Problem.of(
+        phi, terms, diffrax.EulerHeun(), 0, 1, 0.125, jnp.zeros(()), None, None, 1
+    )
+    plan = ds.ValueFunctions(1, 256, 256).prepare(problem, KEY, jax.devices()[:1])
+    samples = jax.jit(plan.sampler)(jr.split(jr.key(3), 1000))
+    assert np.sum(samples.also_failed) > 10
+    assert not np.any(samples.num_failed) and np.all(samples.good)
+    assert np.all(np.isfinite(samples.averaged.value))
+    assert abs(np.mean(samples.averaged.value)) < 1e-12
+
+
+def _newton_steps(problem, keys):
+    """Samples of the number of Newton's steps, of which none count as failed."""
+    newton_steps = problem.solver.root_finder.newton_steps
+    ones = jnp.ones(len(keys), bool)
+    return Samples(
+        Averaged(jnp.full((1, len(keys), 1), float(newton_steps))),
+        good=ones,
+        num_failed=jnp.zeros((1, len(keys)), bool),
+        also_failed=ones if newton_steps == 0 else ~ones,
+    )
+
+
+def test_newtons_method_takes_part_where_paths_fail_that_do_not_count():
+    problem = Problem.of(SQUARE, PENDULUM, MIDPOINT, 0, 1, 0.25, Y0, None, None, 1)
+    sampler = jax.tree_util.Partial(_newton_steps, problem)
+    plan = SamplingPlan(sampler, Outputs.of(problem), num_samples=8, batch_size=4)
+    got = run(plan, KEY, tuple(jax.devices()[:1]))
+    assert got.mean == MIDPOINT.root_finder.newton_steps > 0
 
 
 def test_a_solver_that_remembers_steps_goes_on_with_its_own_state():

@@ -127,6 +127,7 @@ def _samples_of(
         Averaged(value, plain=plain, control=plain - value),
         good=~(has_failed & has_own_law),
         num_failed=simulated.failed & has_own_law,
+        also_failed=has_failed & ~has_own_law,
     )
 
 
