@@ -226,7 +226,7 @@ def _default_batch_size(engine: str, problem: Problem) -> int:
     entries_of_batch = _ENTRIES_OF_BATCH[engine]
     if jax.default_backend() != "cpu":
         entries_of_batch *= _FACTOR_ON_ACCELERATORS
-    entries_of_path = sum(leaf.size for leaf in jtu.tree_leaves(problem.y0))
+    entries_of_path = problem.num_components
     return max(_FEWEST_PATHS, entries_of_batch // entries_of_path)
 
 

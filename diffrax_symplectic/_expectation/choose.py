@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax.random as jr
-import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
@@ -13,7 +12,7 @@ from .._simulation import has_discrete_increments, Problem
 from .._solver import Want
 from .cost import OPERATIONS_PER_SECOND, operations_per_step
 from .estimate import Expectation
-from .fitted import count_outcomes, MOST_DIMENSIONS_OF_GRID, ValueFunctions
+from .fitted import count_outcomes, suits_grid, ValueFunctions
 from .fused_paths import fused_plan
 from .independent import IndependentPaths
 from .kinks import has_kinks
@@ -24,12 +23,6 @@ from .sorted import ArrayRQMC, word_layout
 # Folded into the key of a call to draw trials. Numbers of samples, from which the keys of
 # samples are folded, are smaller.
 _TRIAL_KEY = 0xFFFFFFFF
-# Value functions are chosen where they are fitted on a grid, up to this many outcomes of
-# one step and of all steps. A fit takes each outcome at each point. With 32 points along
-# each of two axes that is less than `basis_choice` allows (32^2 * 48 = 49,152 for one
-# step).
-_MOST_OUTCOMES_OF_STEP = 48
-_MOST_OUTCOMES_OF_STEPS = 2**12
 # Paths are sorted in up to this many dimensions: the default of 2^14 paths leaves eleven
 # along each of four coordinates.
 _MOST_COMPONENTS_SORTED = 4
@@ -46,12 +39,14 @@ _PATHS = 2**17
 _MOST_SAMPLES = 10**9
 # Without a tolerance, paths take no more than about this many seconds on two cores, since
 # compiling, fits and checks take longer, and the user waits for all of them.
-_SECONDS_OF_PATHS = 3
+_SECONDS_OF_PATHS = 1.5
 # Sorted paths are drawn and sorted before each step, which takes as long as this many
 # operations for each path.
-_OPERATIONS_OF_SORTING = 3000
-# The fewest paths, however long they take: fewer do not know their own spread.
+_OPERATIONS_OF_SORTING = 1500
+# The fewest paths, and paths of each replicate, however long they take: fewer do not know
+# their own spread.
 _FEWEST_PATHS = 2**8
+_FEWEST_PATHS_OF_REPLICATE = 2**7
 # The sizes of a trial, a part of those of an estimate: it looks for changes that are
 # several times the error of both.
 _REPLICATES_OF_TRIAL = 8
@@ -183,12 +178,14 @@ def sampling_for(
     if engine == "drjit":
         # This engine takes independent paths only, so there is nothing to choose.
         return _independent_sampling(problem, tol), ""
-    num_components = _num_components(problem)
     num_outcomes = count_outcomes(problem)
-    size = f"{num_components} components of the state, {_num_steps(problem):,} steps"
+    size = f"{problem.num_components} components of the state, {_num_steps(problem):,} steps"
     if num_outcomes:
         size += f" of {num_outcomes} outcomes each"
-    if _suits_value_functions(problem, num_outcomes):
+    # Value functions leave the variance of random starts, for which their few paths do not
+    # suffice. With a tolerance, levels are added until a fit takes far longer.
+    is_random_by_noise = bool(num_outcomes) and not problem.paths_differ
+    if is_random_by_noise and suits_grid(problem, may_take_long=tol is not None):
         sampling = ValueFunctions(num_paths=_MOST_SAMPLES) if tol else ValueFunctions()
         return sampling, f"value functions for {size}"
     sampling = array_rqmc_for(problem, tol)
@@ -213,18 +210,19 @@ def array_rqmc_for(problem: Problem, tol: float | None) -> ArrayRQMC | None:
     if not _suits_sorting(problem):
         return None
     default = ArrayRQMC()
-    # The operations of each step, for one more path in every replicate.
-    operations = default.replicates * (
-        operations_per_step(problem) + _OPERATIONS_OF_SORTING
+    # The operations of each step, for one more path.
+    operations = operations_per_step(problem) + _OPERATIONS_OF_SORTING
+    num_affordable = np.clip(
+        int(_affordable_operations(problem) / operations),
+        default.replicates * _FEWEST_PATHS_OF_REPLICATE,
+        default.replicates * default.num_paths,
     )
-    num_affordable = int(_affordable_operations(problem) / operations)
-    num_affordable = max(num_affordable, _FEWEST_PATHS)
-    # Sobol' points need a power of two: the largest that is affordable.
-    power_of_two = 2 ** (num_affordable.bit_length() - 1)
-    return ArrayRQMC(
-        num_paths=min(power_of_two, default.num_paths),
-        replicates=_MOST_SAMPLES if tol else default.replicates,
-    )
+    # Sobol' points need a power of two: the largest for so many replicates. What is left is
+    # time for more of them.
+    of_replicate = int(num_affordable) // default.replicates
+    num_paths = 2 ** (of_replicate.bit_length() - 1)
+    replicates = int(num_affordable) // num_paths
+    return ArrayRQMC(num_paths, _MOST_SAMPLES if tol else replicates)
 
 
 def _affordable_operations(problem: Problem) -> float:
@@ -240,33 +238,14 @@ def trial_sampling(problem: Problem) -> AbstractSampling:
     return IndependentPaths(_PATHS_OF_TRIAL)
 
 
-def _num_components(problem: Problem) -> int:
-    return sum(leaf.size for leaf in jtu.tree_leaves(problem.y0))
-
-
 def _num_steps(problem: Problem) -> int:
     """The steps of a path on all levels."""
     return int(np.sum(problem.levels.num_steps))
 
 
-def _suits_value_functions(problem: Problem, num_outcomes: int | None) -> bool:
-    """Whether value functions are the best choice, as far as it is known without a fit.
-    `num_outcomes` is how many outcomes the noise of a step has, `None` if not finitely
-    many."""
-    # Value functions leave the variance of random starts, for which their few paths do not
-    # suffice.
-    if problem.paths_differ or not num_outcomes:
-        return False
-    return (
-        _num_components(problem) <= MOST_DIMENSIONS_OF_GRID
-        and num_outcomes <= _MOST_OUTCOMES_OF_STEP
-        and _num_steps(problem) * num_outcomes <= _MOST_OUTCOMES_OF_STEPS
-    )
-
-
 def _suits_sorting(problem: Problem) -> bool:
     """Whether sorting paths helps, and does not take long."""
-    if _num_components(problem) > _MOST_COMPONENTS_SORTED:
+    if problem.num_components > _MOST_COMPONENTS_SORTED:
         return False
     try:
         return 0 < word_layout(problem.terms).num_words <= _MOST_WORDS

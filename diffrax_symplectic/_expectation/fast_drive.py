@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
@@ -49,7 +48,7 @@ def unresolved_drive(problem: Problem) -> str | None:
     if not depends_on_time(field, problem, problem.y0):
         return None
     h = float(problem.levels.h[-1])
-    size = sum(leaf.size for leaf in jtu.tree_leaves(problem.y0))
+    size = problem.num_components
     most_times = min(_MOST_TIMES, _MOST_NUMBERS // max(size, 1))
     most_steps = max(_FEWEST_STEPS, most_times // _TIMES_IN_STEP)
     numbers = np.arange(problem.finest_steps)

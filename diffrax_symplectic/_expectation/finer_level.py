@@ -26,26 +26,23 @@ from .._terms import (
 )
 from .choose import trial_key
 from .estimate import combined_results, Expectation, label_of
-from .fitted import ValueFunctions, with_half_steps
+from .fitted import ValueFunctions
 from .independent import IndependentPaths
 from .long_steps import unresolved_angle
 from .run import run
 from .sampling import SamplingPlan
 
 
-# The numbers of paths of a trial: more are taken only while their noise hides changes as
-# large as the error.
+# The numbers of paths of a trial on the same noise: more are taken only while their noise
+# hides changes as large as the error.
 _NUMBERS_OF_PATHS = 512, 2048, 8192
-# A trial takes at most this part of the paths of an estimate. A path of a trial has 7 steps
-# for 3, so it takes a small part of the time.
+# A trial takes at most this part of the samples of an estimate. A path of a trial has 7
+# steps for 3 on the same noise, or 2 for 1, so it takes a small part of the time.
 _PART = 8
 _PART_BEYOND_FIRST = 32
 # Fewer paths than this do not know their own spread, and more would take longer than the
 # estimate.
 _FEWEST_PATHS = 32
-# A trial with value functions takes these parts of the samples of an estimate, the second
-# if the first is too noisy.
-_PARTS_OF_SAME_SAMPLING = 8, 2
 # A change is sure if it is this many standard errors from zero: by chance that happens once
 # in 370 times for a single mean, and hardly more often for the largest of many.
 _SURE_OF_ONE = 3
@@ -77,17 +74,20 @@ def trial_with_finer_level(
     Two levels are wrong and agree where both miss what happens in shorter times, such as a
     rotation, a close encounter or a decay, and by chance where phases are lost.
 
-    A trial has few paths, each with the same noise on all levels where the solver allows
-    it, so that their differences vary little. Next to value functions their noise hides
-    changes of a hundred errors. So where a fit is quick, or steps may miss a rotation,
-    paths with value functions are taken again with half the steps, by the programs that are
-    compiled already."""
+    A trial of independent paths has the same noise on all levels where the solver allows
+    it, so that their differences vary little. That hides changes of a hundred errors of
+    value functions and of sorted paths. These are taken again with half the steps, by the
+    programs that are compiled already, which hides changes of ten errors. (Where steps may
+    miss a rotation, that would not clear sorted paths of the suspicion.)"""
     if any(map(has_unknown_law, brownian_paths(problem.terms))):
         return Trial()
     key = trial_key(key)
     is_fitted = isinstance(estimate.sampling, ValueFunctions)
-    any_steps = problem.with_any_steps()
-    if is_fitted and (plan.is_fit_quick or unresolved_angle(any_steps) is not None):
+    angle = unresolved_angle(problem.with_any_steps())
+    has_same_sampling = plan.with_half_steps is not None and (
+        is_fitted or angle is None
+    )
+    if has_same_sampling:
         changes = _changes_by_same_sampling(estimate, plan, key, devices)
     else:
         changes = _changes_on_same_noise(estimate, problem, key, devices)
@@ -96,10 +96,9 @@ def trial_with_finer_level(
     if changes.are_sure:
         h = float(problem.levels.h[-1]) / 2
         return Trial(message=_message(estimate, changes, h))
-    # Noise next to value functions is always larger, which says little of resolved steps.
-    if is_fitted or not changes.are_hidden:
+    # The noise of fewer samples is always larger, which says little of resolved steps.
+    if is_fitted or has_same_sampling or not changes.are_hidden:
         return Trial()
-    angle = unresolved_angle(any_steps)
     if angle is None:
         return Trial(caveat=_caveat(estimate, changes))
     return Trial(message=_message_on_chance(estimate, problem, changes, angle))
@@ -201,28 +200,25 @@ def _changes_on_same_noise(
 def _changes_by_same_sampling(
     estimate: Expectation, plan: SamplingPlan, key: PRNGKeyArray, devices: Devices
 ) -> _Changes | None:
-    """The changes on samples of the same kind with half the steps, as many as it takes;
-    `None` if too many fail."""
-    plan = with_half_steps(plan, key)
-    trial = None
-    changes = None
-    for part in _PARTS_OF_SAME_SAMPLING:
-        num_samples = max(plan.least_samples, estimate.num_samples // part)
-        plan = plan._replace(num_samples=num_samples)
-        trial = run(plan, key, devices, start=trial)
-        if trial.num_failed > _MOST_FAILED * num_samples * plan.paths_per_sample:
-            return None
-        own = estimate.vectors
-        other = trial.vectors
-        changes = _Changes(
-            sizes=np.abs(other.mean - own.mean),
-            noise=np.hypot(other.std_error, own.std_error),
-            errors=own.error,
-            num_paths=trial.num_paths,
-        )
-        if changes.are_sure or not changes.are_hidden:
-            break
-    return changes
+    """The changes on samples of the same kind with half the steps; `None` if too many
+    fail."""
+    assert plan.with_half_steps is not None
+    # A batch takes as long, however few of its samples count. Two have a mean at least.
+    num_samples = max(2, plan.batch_size, estimate.num_samples // _PART)
+    plan = plan.with_half_steps()._replace(num_samples=num_samples)
+    trial = run(plan, key, devices)
+    if trial.num_failed > _MOST_FAILED * num_samples * plan.paths_per_sample:
+        return None
+    own = estimate.vectors
+    other = trial.vectors
+    # Two samples hardly know their own spread, which is about that of the estimate's.
+    expected = own.std_error * np.sqrt(estimate.num_samples / num_samples)
+    return _Changes(
+        sizes=np.abs(other.mean - own.mean),
+        noise=np.hypot(own.std_error, np.maximum(expected, other.std_error)),
+        errors=own.error,
+        num_paths=trial.num_paths,
+    )
 
 
 def _numbers_of_paths(estimate: Expectation) -> list[int]:

@@ -109,10 +109,11 @@ class SamplingPlan(NamedTuple):
         it, by trials.
     - `is_quick`: whether the samples take less time than compiling their program, which is
         then compiled for speed of compilation.
-    - `is_fit_quick`: whether the plan holds a fit that took less time than this.
     - `rounding_floor`, `digests`: as in `Expectation`.
     - `simulate_paths`: for paths computed outside JAX, maps the number of the first sample
         and the number of samples to an argument that the sampler takes before the keys.
+    - `with_half_steps`: makes the plan with half the steps on all levels, whose samples
+        need no other program; `None` if that would take long.
     """
 
     sampler: Callable[..., Samples]
@@ -126,10 +127,10 @@ class SamplingPlan(NamedTuple):
     reason: str = ""
     remainder: float = 0.0
     is_quick: bool = False
-    is_fit_quick: bool = False
     rounding_floor: int = 1
     digests: dict[str, str] | None = None
     simulate_paths: Callable[[int, int], Any] | None = None
+    with_half_steps: Callable[[], "SamplingPlan"] | None = None
 
 
 class AbstractSampling(eqx.Module):

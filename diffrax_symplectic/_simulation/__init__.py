@@ -28,7 +28,6 @@ from .levels import (
     combinations,
     Combination,
     finer_change_weights,
-    halved,
     Level,
     level_weights,
     MOST_LEVELS,

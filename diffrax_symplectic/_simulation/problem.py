@@ -65,7 +65,7 @@ from .arguments import (
     traced_phi,
 )
 from .layout import Layout
-from .levels import Level, level_weights, levels_of, MOST_LEVELS
+from .levels import halved, Level, level_weights, levels_of, MOST_LEVELS
 
 
 # The number that is folded into the key of a sample to draw its `y0` and `args`. The words
@@ -231,11 +231,20 @@ class Problem(eqx.Module):
         other numbers of steps compile nothing anew."""
         return dataclasses.replace(self, most_steps=0)
 
+    def with_half_steps(self) -> "Problem":
+        """The same problem with half the steps on all levels."""
+        return dataclasses.replace(self, levels=halved(self.levels))
+
     def level(self, index: IntScalarLike) -> Level:
         """The level with this number, which may be traced."""
         if is_traced(index):
             return jtu.tree_map(lambda x: jnp.asarray(x)[index], self.levels)
         return jtu.tree_map(lambda x: x[index], self.levels)
+
+    @property
+    def num_components(self) -> int:
+        """The number of real numbers in the state."""
+        return sum(leaf.size for leaf in jtu.tree_leaves(self.y0))
 
     @property
     def finest_steps(self) -> int:

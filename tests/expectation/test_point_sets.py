@@ -11,12 +11,21 @@ from diffrax_symplectic._expectation.sorted.hilbert import (
     hilbert_order,
 )
 from diffrax_symplectic._expectation.sorted.points import (
+    _JOE_AND_KUO,
+    _sobol_points_of_scipy,
     balanced_in_sixths,
     nested_scramble,
     num_seeds,
     scrambled,
     sobol_points,
 )
+
+
+@pytest.mark.parametrize("n", [2, 64, 2**14])
+def test_direction_numbers_are_those_of_scipy(n):
+    for d in (1, len(_JOE_AND_KUO), len(_JOE_AND_KUO) + 1):
+        points = _sobol_points_of_scipy(n, d)
+        np.testing.assert_array_equal(sobol_points(n, d), points)
 
 
 def test_points_are_a_digital_net_after_scrambling():

@@ -358,7 +358,7 @@ def test_a_solver_that_remembers_steps_goes_on_with_its_own_state():
     "state, noises, steps, gaussian, kind",
     [
         (2, 1, 4, False, ds.ValueFunctions),
-        (2, 1, 2**11, False, ds.ArrayRQMC),
+        (2, 1, 2**14, False, ds.ArrayRQMC),
         (2, 4, 4, False, ds.ArrayRQMC),
         (2, 1, 4, True, ds.ArrayRQMC),
         (4, 1, 4, False, ds.ArrayRQMC),

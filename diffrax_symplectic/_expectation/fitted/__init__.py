@@ -12,6 +12,6 @@ Axes of arrays, beside those of `_simulation/problem.py`: `C` candidates, among 
 choose, `P` polynomials, `K` outcomes of a step. Of random variables there are `n` as well.
 """
 
-from .basis_choice import MOST_DIMENSIONS_OF_GRID
+from .basis_choice import suits_grid
 from .noise import count_outcomes
-from .value_functions import ValueFunctions, with_half_steps
+from .value_functions import ValueFunctions

@@ -4,7 +4,6 @@ import math
 import warnings
 from typing import NamedTuple
 
-import jax.tree_util as jtu
 import numpy as np
 
 from ..._arguments import whole_number
@@ -17,7 +16,7 @@ from .polynomials import num_polynomials
 
 # By default a grid is used in up to this many dimensions: in three, 32 points along each
 # axis are 32,768 together, each with all outcomes of a step.
-MOST_DIMENSIONS_OF_GRID = 2
+_MOST_DIMENSIONS_OF_GRID = 2
 # The points along an axis: as many as memory and time allow.
 _SIZES_OF_GRID = (64, 32)
 # A fit computes the end of a step from each point for each node of the noise. The most ends
@@ -33,11 +32,11 @@ _HIGHEST_DEGREE = 8
 _ALWAYS_TRIED_UP_TO = 2
 # The most bytes that a fit may take, so that it fits into machines of 8 GiB.
 _MOST_MEMORY = 4 * 2**30
-# A fit with at most this many entries of states takes less time than compiling a program.
-# (Where a program of paths took 4.4 s of processor time, a fit with 600,000 took 0.2 s.)
-_MOST_OF_QUICK_FIT = 2**21
-# The most entries of states that a fit computes without a warning that it will take long
-# (about a minute).
+# A fit that computes at most this many numbers takes less time than compiling its program.
+# (Fits of two coordinates took 0.4 s of processor time for 2.5 million numbers, and 9 and
+# 11 s for 54 and 82 million, where compiling took 5 s.)
+_MOST_OF_QUICK_FIT = 2**24
+# The most that a fit computes without a warning that it will take long.
 _MOST_WITHOUT_WARNING = 2**31
 
 
@@ -45,12 +44,18 @@ class ChosenBasis(NamedTuple):
     """A basis, and what a fit to it costs.
 
     - `num_states`: the number of states that are computed in each step.
-    - `num_entries`: the number of entries of all states of all steps.
+    - `num_numbers`: the numbers that are computed in all steps: the components of states,
+        and the functions at each of them.
     """
 
     basis: AbstractBasis
     num_states: int
-    num_entries: int
+    num_numbers: int
+
+    @property
+    def is_quick(self) -> bool:
+        """Whether the fit takes less time than compiling its program."""
+        return self.num_numbers <= _MOST_OF_QUICK_FIT
 
 
 def chosen_basis(problem: Problem, degree: int | None) -> ChosenBasis:
@@ -62,17 +67,22 @@ def chosen_basis(problem: Problem, degree: int | None) -> ChosenBasis:
     total_steps = int(np.sum(problem.levels.num_steps))
     basis = _basis(problem, degree, num_nodes, total_steps)
     num_states = basis.num_sites * num_nodes
-    return ChosenBasis(basis, num_states, num_states * total_steps * basis.d)
+    numbers_of_state = basis.d + math.prod(problem.output_shape)
+    return ChosenBasis(basis, num_states, num_states * total_steps * numbers_of_state)
 
 
-def is_quick(chosen: ChosenBasis) -> bool:
-    """Whether a fit takes less time than compiling a program."""
-    return chosen.num_entries <= _MOST_OF_QUICK_FIT
+def suits_grid(problem: Problem, may_take_long: bool) -> bool:
+    """Whether value functions can be fitted on a grid, by default only if that is quick.
+    Steps have finitely many outcomes."""
+    if problem.num_components > _MOST_DIMENSIONS_OF_GRID:
+        return False
+    chosen = chosen_basis(problem, None)
+    return isinstance(chosen.basis, Grid) and (may_take_long or chosen.is_quick)
 
 
 def warn_of_long_fit(chosen: ChosenBasis, stacklevel: int) -> None:
     """Warns if a fit takes long next to independent paths."""
-    if chosen.num_entries > _MOST_WITHOUT_WARNING:
+    if chosen.num_numbers > _MOST_WITHOUT_WARNING:
         warnings.warn(
             f"The fit of `ValueFunctions` takes as long as {chosen.num_states:,} "
             "independent paths. If fewer paths are accurate enough, pass "
@@ -87,7 +97,7 @@ def _basis(
     """A grid if it fits into memory and time, or polynomials of several degrees to try; for
     a given `degree`, polynomials of this degree. The noise has `num_nodes` in a step, and
     all levels together have `total_steps`."""
-    d = sum(leaf.size for leaf in jtu.tree_leaves(problem.y0))
+    d = problem.num_components
     if degree is None:
         grid = _finest_grid(problem, d, num_nodes, total_steps)
         if grid is not None:
@@ -109,7 +119,7 @@ def _finest_grid(
 ) -> Grid | None:
     """The finest grid that memory and time allow; `None` if there is none, or in many
     dimensions."""
-    if d > MOST_DIMENSIONS_OF_GRID:
+    if d > _MOST_DIMENSIONS_OF_GRID:
         return None
     for size in _SIZES_OF_GRID:
         grid = Grid(d, (size,))

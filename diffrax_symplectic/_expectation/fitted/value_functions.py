@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from ..._arguments import check_memory, check_untraced, whole_number
 from ..._lapack import lapack_in_turn
 from ..._programs import compiled
-from ..._simulation import Combination, halved, Problem
+from ..._simulation import Combination, Problem
 from ..._solver import without_newton
 from ..estimate import combined_results, Expectation
 from ..run import run
@@ -33,7 +33,7 @@ from ..sampling import (
     saved_by_name,
 )
 from .bases import AbstractBasis
-from .basis_choice import chosen_basis, is_quick, warn_of_long_fit
+from .basis_choice import chosen_basis, warn_of_long_fit
 from .controlled_paths import controlled_paths
 from .fits import Choice, fit, FittedFunctions
 from .mixture import Mixture
@@ -142,18 +142,21 @@ class ValueFunctions(AbstractSampling):
         some_fail = any(trial.num_failed > 0 for trial in trials_of_candidates)
         if some_fail or not np.any(choice.used):
             mixture = mixture.own_law_alone()
-        return plan_for(choice, mixture, self.num_paths)._replace(
-            is_fit_quick=is_quick(chosen),
+        plan = plan_for(choice, mixture, self.num_paths)
+        return plan._replace(
             reason=_reason(basis, choice),
             remainder=comparison.remainder(problem.dtype),
+            with_half_steps=(
+                ft.partial(_with_half_steps, plan, key) if chosen.is_quick else None
+            ),
         )
 
 
-def with_half_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
-    """A plan of `ValueFunctions` with half the steps on all levels. It compiles nothing,
-    and only the last level is fitted: the others have had their steps already."""
+def _with_half_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
+    """A plan of `ValueFunctions` with half the steps on all levels. Only the last level is
+    fitted: the others have had their steps already."""
     problem, functions, *others = plan.sampler.args  # pyright: ignore (a `Partial`)
-    finer_problem = dataclasses.replace(problem, levels=halved(problem.levels))
+    finer_problem = problem.with_half_steps()
     last_level = len(problem.levels.h) - 1
     last_functions = _fits(finer_problem, key, functions.basis, [last_level])
     known_functions = jtu.tree_map(lambda x: x[1:], functions)

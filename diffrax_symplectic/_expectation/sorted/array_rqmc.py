@@ -135,22 +135,22 @@ class ArrayRQMC(AbstractSampling):
         check_memory("num_paths", self.num_paths, problem.bytes_of_state, devices[0])
         points = jnp.asarray(sobol_points(self.num_paths, layout.num_words))
         _warn_of_many_coordinates(self.num_paths, num_coordinates, stacklevel=5)
-        return SamplingPlan(
-            jtu.Partial(
-                _samples_of_replicate,
-                problem.with_any_steps(),
-                sort_by,
-                points,
-                layout,
-            ),
-            Outputs.of(problem),
-            num_samples=self.replicates,
-            # All paths of a replicate are solved at once, which is a batch already.
-            batch_size=1,
-            fields=("value", "heaviness", "largest"),
-            paths_per_sample=self.num_paths,
-            least_samples=_LEAST_REPLICATES,
-        )
+
+        def plan_for(problem: Problem) -> SamplingPlan:
+            return SamplingPlan(
+                jtu.Partial(_samples_of_replicate, problem, sort_by, points, layout),
+                Outputs.of(problem),
+                num_samples=self.replicates,
+                # All paths of a replicate are solved at once, which is a batch already.
+                batch_size=1,
+                fields=("value", "heaviness", "largest"),
+                paths_per_sample=self.num_paths,
+                least_samples=_LEAST_REPLICATES,
+            )
+
+        problem = problem.with_any_steps()
+        with_half_steps = ft.partial(plan_for, problem.with_half_steps())
+        return plan_for(problem)._replace(with_half_steps=with_half_steps)
 
 
 def _samples_of_replicate(

@@ -12,6 +12,25 @@ from jaxtyping import Array, UInt32
 # The number of consecutive points among which a single three-point variable is balanced:
 # its outer values have probability one sixth.
 _BLOCK = 6
+# The primitive polynomials and the first direction numbers of the first coordinates of
+# Sobol' points, by Joe and Kuo (2008). The first coordinate needs neither. SciPy has
+# 21,201, but importing it takes 2.4 s of processor time, where a first estimate takes 15.
+_JOE_AND_KUO: tuple[tuple[int, tuple[int, ...]], ...] = (
+    (0b1, ()),
+    (0b11, (1,)),
+    (0b111, (1, 3)),
+    (0b1011, (1, 3, 1)),
+    (0b1101, (1, 1, 1)),
+    (0b10011, (1, 1, 3, 3)),
+    (0b11001, (1, 3, 5, 13)),
+    (0b100101, (1, 1, 5, 5, 17)),
+    (0b101001, (1, 1, 5, 5, 5)),
+    (0b101111, (1, 1, 7, 11, 19)),
+    (0b110111, (1, 1, 5, 1, 1)),
+    (0b111011, (1, 1, 1, 3, 11)),
+    (0b111101, (1, 3, 5, 5, 31)),
+)
+_BITS = 32
 
 
 # Only the last set of points is kept, since one may take a gigabyte.
@@ -27,12 +46,42 @@ def sobol_points(num_points: int, dimension: int) -> np.ndarray:
     The direction numbers are from
     [Joe and Kuo (2008)](https://doi.org/10.1137/070709359), as in SciPy.
     """
-    # SciPy is imported here because that takes most of a second.
+    if dimension > len(_JOE_AND_KUO):
+        return _sobol_points_of_scipy(num_points, dimension)
+    numbers = [_direction_numbers(*parameters) for parameters in _JOE_AND_KUO]
+    # (bits, d)
+    numbers = np.array(numbers[:dimension], np.uint32).T
+    # Neighbours in the order of the Gray code differ in one bit.
+    index = np.arange(num_points, dtype=np.uint32)
+    gray_code = index ^ (index >> 1)
+    points = np.zeros((num_points, dimension), np.uint32)
+    for b in range(num_points.bit_length() - 1):
+        bit = (gray_code >> b) & 1
+        points ^= bit[:, None] * numbers[b]
+    return points
+
+
+def _sobol_points_of_scipy(num_points: int, dimension: int) -> np.ndarray:
     from scipy.stats import qmc
 
-    sequence = qmc.Sobol(dimension, scramble=False, bits=32)
+    sequence = qmc.Sobol(dimension, scramble=False, bits=_BITS)
     points = sequence.random_base2(num_points.bit_length() - 1)
-    return (points * 2.0**32).astype(np.uint32)
+    return (points * 2.0**_BITS).astype(np.uint32)
+
+
+def _direction_numbers(polynomial: int, first: tuple[int, ...]) -> list[int]:
+    """The direction numbers of a coordinate, each of 32 bits, from the coefficients of a
+    primitive polynomial, as bits, and the first numbers."""
+    degree = polynomial.bit_length() - 1
+    # The numbers `m` of section 2 of Joe and Kuo: odd, and the k-th of them below `2^k`.
+    m = [*first] if first else [1] * _BITS
+    for k in range(len(m), _BITS):
+        next_number = m[k - degree]
+        for j in range(1, degree + 1):
+            coefficient = (polynomial >> (degree - j)) & 1
+            next_number ^= coefficient * (m[k - j] << j)
+        m.append(next_number)
+    return [m_k << (_BITS - 1 - k) for k, m_k in enumerate(m)]
 
 
 def nested_scramble(
