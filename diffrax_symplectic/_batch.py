@@ -132,37 +132,36 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
     def serve(pending, value, own_arrays, common_arrays):
         return in_groups(pending, value, own_arrays, common_arrays)
 
+    # Nested batches are joined into one, so that stragglers of all share the groups: arrays
+    # of paths, of shape `(outer, inner, ...)`, become `(outer * inner, ...)`.
     @serve.def_vmap
-    def _(size, in_batched, pending, value, own_arrays, common_arrays):
-        # Nested batches are joined into one: stragglers of all of them share the groups.
-        # The axes of an array are (outer batch, inner batch, ...).
-        inner_size = pending.shape[1 if in_batched[0] else 0]
+    def _(size, in_batched, *paths_and_common):
+        *are_paths_batched, are_common_batched = in_batched
+        *paths, common_arrays = paths_and_common
+        paths = _repeated(size, are_paths_batched, paths)
+        pending, _, _ = paths
+        _, inner_size = pending.shape
 
-        def join_axes(is_batched: bool, x: Array) -> Array:
-            x = x if is_batched else jnp.broadcast_to(x, (size, *x.shape))
+        def join_axes(x: Array) -> Array:
             return x.reshape(size * inner_size, *x.shape[2:])
-
-        def repeated_if_batched(is_batched: bool, x: Array) -> Array | None:
-            return jnp.repeat(x, inner_size, axis=0) if is_batched else None
 
         def separate_axes(x: Array) -> Array:
             return x.reshape(size, inner_size, *x.shape[1:])
 
-        *are_paths_batched, are_common_batched = in_batched
-        paths = (pending, value, own_arrays)
-        pending, value, own_arrays = jtu.tree_map(
-            join_axes, tuple(are_paths_batched), paths
+        # A common array that differs between the outer batches is repeated for the inner
+        # ones, and is one of the paths' own.
+        def own_if_batched(is_batched: bool, x: Array) -> Array | None:
+            return jnp.repeat(x, inner_size, axis=0) if is_batched else None
+
+        pending, value, own_arrays = jtu.tree_map(join_axes, paths)
+        new_own_arrays = jtu.tree_map(own_if_batched, are_common_batched, common_arrays)
+        joined_value = serve(
+            pending,
+            value,
+            eqx.combine(own_arrays, new_own_arrays),
+            jtu.tree_map(_none_if_batched, are_common_batched, common_arrays),
         )
-        # Common arrays over which the outer batch runs become the joined paths' own.
-        new_own_arrays = jtu.tree_map(
-            repeated_if_batched, are_common_batched, common_arrays
-        )
-        own_arrays = eqx.combine(own_arrays, new_own_arrays)
-        common_arrays = jtu.tree_map(
-            _none_if_batched, are_common_batched, common_arrays
-        )
-        value = serve(pending, value, own_arrays, common_arrays)
-        return jtu.tree_map(separate_axes, value), _all_batched(value)
+        return jtu.tree_map(separate_axes, joined_value), _all_batched(value)
 
     # One path is a batch of one, and all captured arrays are common.
     no_own_arrays = jtu.tree_map(lambda _: None, arrays)

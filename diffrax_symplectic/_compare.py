@@ -39,7 +39,6 @@ from ._terms import (
     shapes_as_paths,
     with_paths,
     with_programs,
-    without_truncation,
 )
 
 
@@ -293,7 +292,7 @@ class _ComparedSystem(NamedTuple):
         def results(key: PRNGKeyArray, dt: Array) -> PathResults:
             # Increments are not truncated: paths fail where a step has no solution, and are
             # counted.
-            own_terms = without_truncation(with_paths(make_path, numbers, terms, key))
+            own_terms = with_paths(make_path, numbers, terms, key)
             check_stratonovich(own_terms, solver, t0, y0, args)
             sol = diffrax.diffeqsolve(
                 own_terms, solver, t0, t1, dt, y0, args, max_steps=None,

@@ -384,8 +384,8 @@ class StepTimes(NamedTuple):
         _, *other_state = self.init_state.controller_state
         initial_time = self.init_state.tprev
         time_after_first_step = self.init_state.tnext
-        # The controller computes times from the number of steps in its state alone, and
-        # returns the step size that `t0` and `t1` give beside them, which is not used.
+        # The controller computes the end of a step from the number of steps in its state,
+        # and its start from `t1`, which is not used.
         _, _, time_after_step, *_ = self.controller.adapt_step_size(
             t0=initial_time,
             t1=time_after_first_step,

@@ -236,25 +236,27 @@ _lock = threading.Lock()
 def _interned(program: _Program, identity: Any) -> _Program:
     """The program that was known before, if one computes the same. `identity` is as for
     `traced`."""
-    rules: list[Any] = []
-    described = (
-        _described(program.jaxpr, rules),
+    named: list[Any] = []
+    description = (
+        _description(program.jaxpr, named),
         tuple(program.is_array),
         program.treedef,
         static_part(program.static),
     )
     # What a custom derivative or a callback computes is named in a trace, not written out.
     # Then only the same function has the same program.
-    key = described, static_part(identity) if rules else None
+    key = description, static_part(identity) if named else None
     with _lock:
         known = _known.setdefault(key, program)
     if not known.text:
-        known.text = _hash(_without_addresses(repr(described)))
+        known.text = _hash(_without_addresses(repr(description)))
     return known
 
 
-def _described(jaxpr: Jaxpr, rules: list[Any]) -> Hashable:
-    """All that a program computes. Appends to `rules` what is not described, but named."""
+def _description(jaxpr: Jaxpr, named: list[Any]) -> Hashable:
+    """All that a program computes: equal for equal programs, since variables are numbered
+    as they appear. Appends to `named` what is named in it, but not described, such as
+    callbacks."""
     number_of: dict[Any, int] = {}
     # Most operations have the same context, whose text is long.
     contexts: dict[int, str] = {}
@@ -272,7 +274,7 @@ def _described(jaxpr: Jaxpr, rules: list[Any]) -> Hashable:
         context = contexts.setdefault(id(eqn.ctx), str(eqn.ctx))
         operands = tuple(map(variable, eqn.invars))
         results = tuple(map(variable, eqn.outvars))
-        params = _described_value(eqn.params, rules)
+        params = _description_of_value(eqn.params, named)
         operations.append((eqn.primitive, context, operands, params, results))
     outputs = tuple(map(variable, jaxpr.outvars))
     return tuple(inputs), tuple(operations), outputs
@@ -288,25 +290,27 @@ def _dtype_of(aval: Any) -> str:
     return dtype
 
 
-def _described_value(x: Any, rules: list[Any]) -> Hashable:
+def _description_of_value(x: Any, named: list[Any]) -> Hashable:
     """A parameter of an operation."""
     if is_program(x):
         # The arrays that a program within the function closes over are part of it.
         consts = x.consts if isinstance(x, ClosedJaxpr) else ()
-        values = tuple(_described_value(const, rules) for const in consts)
+        values = tuple(_description_of_value(const, named) for const in consts)
         jaxpr: Any = x.jaxpr if isinstance(x, ClosedJaxpr) else x
-        return values, _described(jaxpr, rules)
+        return values, _description(jaxpr, named)
     if isinstance(x, Mapping):
-        return tuple((name, _described_value(x[name], rules)) for name in sorted(x))
+        return tuple(
+            (name, _description_of_value(x[name], named)) for name in sorted(x)
+        )
     if isinstance(x, tuple | list):
-        return type(x), tuple(_described_value(item, rules) for item in x)
+        return type(x), tuple(_description_of_value(item, named) for item in x)
     if eqx.is_array(x):
         return _array_value(x)
     if isinstance(x, float | complex):
         # Zeros of both signs are equal, and NaN is not equal to itself.
         return type(x), repr(x)
     if is_rule(x) or not _is_hashable(x):
-        rules.append(x)
+        named.append(x)
         return type(x)
     return type(x), x
 
@@ -397,37 +401,44 @@ def compiled(fn: Callable[..., Result], quickly: bool = False) -> Callable[..., 
     compile by the newer generator, and 1.8 to 3.2 s by the older one. Both programs run at
     the same speed."""
 
+    # Not by `eqx.filter_jit`, whose cache would keep the programs that are dropped here.
+    options = quick_options() if quickly else {}
+
     @ft.wraps(fn)
     def call(*args: Any) -> Result:
         leaves, treedef = jtu.tree_flatten(args)
         is_array = [eqx.is_array(leaf) for leaf in leaves]
-        static = [None if is_it else leaf for is_it, leaf in zip(is_array, leaves)]
+        arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
+        others = [None if eqx.is_array(leaf) else leaf for leaf in leaves]
 
         def of_arrays(arrays: list[Array]) -> Result:
             remaining = iter(arrays)
-            whole = [
-                next(remaining) if is_it else x for is_it, x in zip(is_array, static)
+            leaves = [
+                next(remaining) if is_array else other
+                for is_array, other in zip(is_array, others)
             ]
-            return fn(*treedef.unflatten(whole))
+            return fn(*treedef.unflatten(leaves))
 
         def jitted() -> Callable:
-            # What `equinox.filter_jit` compiled would not be freed with it.
-            return jax.jit(
-                of_arrays, compiler_options=quick_options() if quickly else {}
-            )
+            return jax.jit(of_arrays, compiler_options=options)
 
-        key = fn, quickly, treedef, tuple(is_array), static_part(static)
-        arrays = [x for is_it, x in zip(is_array, leaves) if is_it]
+        key = fn, quickly, treedef, tuple(is_array), static_part(others)
         try:
             return _programs.get(key, jitted)(arrays)
         except ValueError as error:
-            # JAX refuses options for a program inside of another, or one that captures
-            # values of another, before it calls `fn`. It has no class of errors for this.
-            if "`compiler_options`" not in str(error):
+            if not _refuses_options(error):
                 raise
-        return compiled(fn)(*args)
+        without_options = compiled(fn)
+        return without_options(*args)
 
     return call
+
+
+def _refuses_options(error: ValueError) -> bool:
+    """Whether JAX refuses options of the compiler, as it does for a program inside of
+    another, or one that captures values of another, before it calls the function. It has
+    no class of errors for this."""
+    return "`compiler_options`" in str(error)
 
 
 # The user's functions that are called while a trace is made, with their inputs.

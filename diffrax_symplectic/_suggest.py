@@ -31,6 +31,7 @@ from ._solver import (
     LangevinMiddle,
     LevyAreaMidpoint,
     NinomiyaVictoir,
+    own_path,
     PlateauGauss,
     PlateauVerlet,
     Record,
@@ -67,8 +68,8 @@ from ._terms import (
     with_paths,
     with_paths_for_shapes,
     with_programs,
+    with_truncation,
     without_constraint,
-    without_truncation,
 )
 
 
@@ -227,13 +228,16 @@ def suggest_solver(
 
     numbers = motion_numbers(random_paths(terms))
 
-    # Solvers make paths without knowing what they drive, so some are truncated needlessly.
     needed = which_need_truncation(terms, t0, y0, args)
 
-    def terms_with(make_path: Callable) -> jtu.Partial:
-        """The function of a key that returns the terms with paths made by `make_path`."""
-        fill = ft.partial(_terms_with_paths, make_path, numbers, needed)
-        return jtu.Partial(fill, given_terms)
+    def terms_for(solver: AbstractSymplecticSolver) -> jtu.Partial:
+        """The function of a key that returns the terms with paths of this solver."""
+        is_implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+        which = tuple(is_implicit and need for need in needed)
+        make_path = ft.partial(own_path, solver, want)
+        return jtu.Partial(
+            ft.partial(_terms_with_paths, make_path, numbers, which), given_terms
+        )
 
     suggestions = tuple(
         _suggestion(
@@ -242,7 +246,7 @@ def suggest_solver(
             terms,
             commute=system.commute,
             needs_bounded=any(needed),
-            terms_with=terms_with,
+            terms_of_key=terms_for(solver),
         )
         for solver in solvers
     )
@@ -258,15 +262,12 @@ def suggest_solver(
 def _terms_with_paths(
     make_path: Callable,
     numbers: tuple[int, ...],
-    needed: tuple[bool, ...],
+    which_truncated: tuple[bool, ...],
     terms: diffrax.AbstractTerm,
     key: PRNGKeyArray,
 ) -> diffrax.AbstractTerm:
-    """The terms with paths made by `make_path` for this key, truncated only where that is
-    `needed`."""
-    needless = [not is_needed for is_needed in needed]
-    filled = with_paths(make_path, numbers, terms, key)
-    return without_truncation(filled, needless)
+    """The terms with paths made by `make_path` for this key."""
+    return with_truncation(with_paths(make_path, numbers, terms, key), which_truncated)
 
 
 class _System(NamedTuple):
@@ -507,11 +508,10 @@ def _suggestion(
     terms: diffrax.AbstractTerm,
     commute: bool,
     needs_bounded: bool,
-    terms_with: Callable,
+    terms_of_key: Callable,
 ) -> Suggestion:
     """The suggestion of this solver. `needs_bounded` is whether implicit steps need bounded
-    increments. `terms_with(make_path)` returns, as a function of a key, the terms with
-    paths that are made by `make_path`."""
+    increments. `terms_of_key` is the field `terms` of the suggestion."""
     record = _record(solver)
     return Suggestion(
         solver=solver,
@@ -519,7 +519,7 @@ def _suggestion(
         strong_order=record.order("strong", commute),
         path=_path_code(solver, want, terms, needs_bounded),
         reason=record.reason,
-        terms=terms_with(ft.partial(solver.path, want=want)),
+        terms=terms_of_key,
     )
 
 

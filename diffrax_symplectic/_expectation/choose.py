@@ -179,7 +179,8 @@ def sampling_for(
         # This engine takes independent paths only, so there is nothing to choose.
         return _independent_sampling(problem, tol), ""
     num_outcomes = count_outcomes(problem)
-    size = f"{problem.num_components} components of the state, {_num_steps(problem):,} steps"
+    num_steps = _num_steps(problem)
+    size = f"{problem.num_components} components of the state, {num_steps:,} steps"
     if num_outcomes:
         size += f" of {num_outcomes} outcomes each"
     # Value functions leave the variance of random starts, for which their few paths do not

@@ -26,7 +26,6 @@ from .._terms import (
     motion_numbers,
     random_paths,
     with_paths,
-    without_truncation,
 )
 from .call import checked_call
 from .choose import choose, Request, trial_key, trial_sampling
@@ -330,7 +329,7 @@ def _trial_with_gaussian_increments(
     numbers = motion_numbers(random_paths(problem.terms))
     gaussian_path = ft.partial(own_path, problem.solver, "strong")
     terms = with_paths(gaussian_path, numbers, problem.terms, key)
-    gaussian_problem = dataclasses.replace(problem, terms=without_truncation(terms))
+    gaussian_problem = dataclasses.replace(problem, terms=terms)
     sampling = trial_sampling(gaussian_problem)
     key_of_trial = trial_key(key)
     plan = sampling.prepare(gaussian_problem, key_of_trial, devices)

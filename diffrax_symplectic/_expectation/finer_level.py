@@ -36,10 +36,11 @@ from .sampling import SamplingPlan
 # The numbers of paths of a trial on the same noise: more are taken only while their noise
 # hides changes as large as the error.
 _NUMBERS_OF_PATHS = 512, 2048, 8192
-# A trial takes at most this part of the samples of an estimate. A path of a trial has 7
-# steps for 3 on the same noise, or 2 for 1, so it takes a small part of the time.
-_PART = 8
-_PART_BEYOND_FIRST = 32
+# The largest shares of the samples of an estimate that a trial takes: at first, and if more
+# are needed. A path of a trial has 7 steps for 3 on the same noise, or 2 for 1, so it takes
+# a small part of the time.
+_FIRST_SHARE = 1 / 8
+_LARGEST_SHARE = 1 / 32
 # Fewer paths than this do not know their own spread, and more would take longer than the
 # estimate.
 _FEWEST_PATHS = 32
@@ -179,7 +180,7 @@ def _changes_on_same_noise(
     finer_problem = _with_finer_level(problem, key)
     trial = None
     changes = None
-    for num_paths in _numbers_of_paths(estimate):
+    for num_paths in _trial_sizes(estimate):
         sampling = IndependentPaths(num_paths, _batch_size(estimate))
         plan = sampling.prepare(finer_problem, key, devices)
         trial = run(plan._replace(is_quick=True), key, devices, start=trial)
@@ -204,7 +205,7 @@ def _changes_by_same_sampling(
     fail."""
     assert plan.with_half_steps is not None
     # A batch takes as long, however few of its samples count. Two have a mean at least.
-    num_samples = max(2, plan.batch_size, estimate.num_samples // _PART)
+    num_samples = max(2, plan.batch_size, int(_FIRST_SHARE * estimate.num_samples))
     plan = plan.with_half_steps()._replace(num_samples=num_samples)
     trial = run(plan, key, devices)
     if trial.num_failed > _MOST_FAILED * num_samples * plan.paths_per_sample:
@@ -221,16 +222,16 @@ def _changes_by_same_sampling(
     )
 
 
-def _numbers_of_paths(estimate: Expectation) -> list[int]:
-    """The numbers of paths of the trial of an estimate."""
-    # The fits of value functions take far longer than their paths.
+def _trial_sizes(estimate: Expectation) -> list[int]:
+    """The numbers of paths to try in turn; none if even the first would be too small."""
+    # A fit takes far longer than the largest trial.
     if isinstance(estimate.sampling, ValueFunctions):
         return list(_NUMBERS_OF_PATHS)
     first, *others = _NUMBERS_OF_PATHS
-    first = min(first, estimate.num_paths // _PART)
+    first = min(first, int(_FIRST_SHARE * estimate.num_paths))
     if first < _FEWEST_PATHS:
         return []
-    most = estimate.num_paths // _PART_BEYOND_FIRST
+    most = _LARGEST_SHARE * estimate.num_paths
     return [first] + [number for number in others if number <= most]
 
 

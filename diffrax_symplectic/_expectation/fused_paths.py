@@ -97,8 +97,11 @@ class _Paths(NamedTuple):
 def _samples_of_fused_paths(
     problem: Problem, paths: _Paths, keys: Key[Array, " n"]
 ) -> Samples:
-    """The samples of paths that are known: one for each random key, by which a path draws
-    its `args`, too."""
+    """The samples of paths that a kernel has simulated. From the key of a path its `args`
+    are drawn once more.
+
+    Axes are named as in `_simulation/problem.py`: `S` times, and `m` numbers of `phi` at
+    each."""
     _, args_of_paths = jax.vmap(problem.draw_start)(keys)
 
     # `y` holds the states of a path at all times.

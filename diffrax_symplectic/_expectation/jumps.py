@@ -64,8 +64,9 @@ class _Sides(NamedTuple):
     far_after: Float[Array, " n"]
 
     @property
-    def smooth_change(self) -> Float[Array, ""]:
-        """How much the field changes on either side, and by rounding."""
+    def largest_smooth_change(self) -> Float[Array, ""]:
+        """The largest change from before to after that is no jump: several times that on
+        either side, and by rounding."""
         before = jnp.linalg.norm(self.before - self.far_before)
         after = jnp.linalg.norm(self.far_after - self.after)
         size = jnp.linalg.norm(jnp.stack(self))
@@ -160,22 +161,26 @@ def _jumping_stages(
     problem: Problem, solver: AbstractSymplecticRungeKutta
 ) -> str | None:
     """`jumps_at_step_ends` for tableaus."""
+    # Two levels extrapolate by the weak order, or by 1 if there is none.
     if solver.weak_order(problem.terms) in (1, None):
         return None
     drift, noise = split_terms(without_constraint(problem.terms))
-    at_ends = [s for s in solver.tableau.flatten().stages if s.c in (0, 1)]
-    end = None
-    what = "forces jump"
-    # Velocities do not depend on time, so the stages of positions may be anywhere.
-    if drift and any(s.channels == ("h",) and s.writes != "q" for s in at_ends):
-        field = drift_field(drift, problem.args)
-        end = _first_jump_at_end(field, problem, problem.y0)
-    if end is None and noise and any(s.channels != ("h",) for s in at_ends):
-        what = "noise jumps"
-        field = noise_field(noise, problem.args)
-        end = _first_jump_at_end(field, problem, problem.y0)
-    if end is None:
+    fields_at_ends = []
+    at_ends = [stage for stage in solver.tableau.flatten().stages if stage.c in (0, 1)]
+    for_drift = [stage for stage in at_ends if stage.channels == ("h",)]
+    # Stages that move positions alone evaluate velocities, which do not depend on time.
+    if drift and any(stage.writes != "q" for stage in for_drift):
+        fields_at_ends.append(("forces jump", drift_field(drift, problem.args)))
+    if noise and len(for_drift) < len(at_ends):
+        fields_at_ends.append(("noise jumps", noise_field(noise, problem.args)))
+    ends = [
+        (what, _first_jump_at_end(field, problem, problem.y0))
+        for what, field in fields_at_ends
+    ]
+    jumps = [(what, end) for what, end in ends if end is not None]
+    if not jumps:
         return None
+    what, end = jumps[0]
     return (
         f"The {what} at step ends, such as t={end:.6g}, and `{type(solver).__name__}` "
         "takes one side of the jump for both steps: the mean converges to first order "
@@ -251,7 +256,7 @@ def _search(
         around = jnp.array([-far, -near, near, far])
         sides = _Sides(*jax.vmap(at_both)(time + around))
         jump = jnp.linalg.norm(sides.after - sides.before)
-        return time, jump > sides.smooth_change
+        return time, jump > sides.largest_smooth_change
 
     changes = lax.map(largest_change, ends, batch_size=_STEPS_AT_ONCE)
     _, largest = lax.top_k(changes, min(_MOST_SEARCHED, len(ends)))
@@ -259,31 +264,32 @@ def _search(
 
 
 def _first_jump_at_end(field: Field, problem: Problem, y0: Y) -> float | None:
-    """The first end of a step at which a field jumps; `None` if there is none."""
+    """The first end of a step at which a field jumps; `None` if there is none. Paths see
+    one side alone of a jump at `t0`, where no step ends."""
     if not depends_on_time(field, problem, y0):
         return None
     steps = _steps_of(problem)
     if steps is None:
         return None
-    # A jump at `t0` is none: paths see one side of it alone.
     ends = steps.starts + steps.h
     is_last = np.arange(1, len(ends) + 1) == problem.finest_steps
-    around = np.array([-steps.far, -steps.near, steps.near, steps.far, 0])
-    times = (ends[:, None] + around).astype(problem.dtype)
-    do_jump = _quick_jumps(field, y0, times, is_last)
-    if not np.any(do_jump):
+    # Those of `_Sides`, and the end itself.
+    offsets = np.array([-steps.far, -steps.near, steps.near, steps.far, 0])
+    times = (ends[:, None] + offsets).astype(problem.dtype)
+    jumps = _quick_jumps_at_ends(field, y0, times, is_last)
+    if not np.any(jumps):
         return None
-    return float(ends[np.argmax(do_jump)])
+    return float(ends[np.argmax(jumps)])
 
 
-def _jumps(
+def _jumps_at_ends(
     field: Field, y0: Y, times: Float[Array, "ends 5"], is_last: Bool[Array, " ends"]
 ) -> Bool[Array, " ends"]:
     """For the end of each step, whether a field jumps there without a mean of both sides.
     `times` are those of `_Sides` and the end itself."""
     at_both = at_both_states(field, y0)
 
-    def jumps_there(end: tuple[Array, Array]) -> Bool[Array, ""]:
+    def jumps_at(end: tuple[Array, Array]) -> Bool[Array, ""]:
         times, is_last = end
         *sides, there = jax.vmap(at_both)(times)
         sides = _Sides(*sides)
@@ -291,11 +297,12 @@ def _jumps(
         # No step follows the last end, so that the side before it is right, too.
         error_at_last = jnp.linalg.norm(there - sides.before)
         error = jnp.where(is_last, jnp.minimum(error, error_at_last), error)
-        # Values that are not finite are no jumps.
-        return 2 * error > sides.smooth_change
+        # A field with the value of one side is off the mean by half of its jump. (Values
+        # that are not finite are no jumps, since NaN is not larger than anything.)
+        return 2 * error > sides.largest_smooth_change
 
-    return lax.map(jumps_there, (times, is_last), batch_size=_STEPS_AT_ONCE)
+    return lax.map(jumps_at, (times, is_last), batch_size=_STEPS_AT_ONCE)
 
 
 _quick_search = compiled(_search, quickly=True)
-_quick_jumps = compiled(_jumps, quickly=True)
+_quick_jumps_at_ends = compiled(_jumps_at_ends, quickly=True)

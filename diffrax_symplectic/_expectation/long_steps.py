@@ -374,17 +374,17 @@ def _frequency_of(
 ) -> Float[Array, ""]:
     """The largest angular frequency of the equation `dx/dt = rate_of(x)` near `x`; zero
     where growth without oscillation is faster."""
-
     derivative = derivative_at(rate_of, x)
 
     # An oscillation has a pair of eigenvalues, i omega and -i omega. Applied twice, the
-    # derivative has -omega^2 in the whole plane of the oscillation. (In a loop, it is
-    # compiled once.)
+    # derivative has -omega^2 in the whole plane of the oscillation.
     def derivative_twice(change: Array) -> Array:
+        # A loop, so that the derivative is compiled once.
         return lax.fori_loop(0, 2, lambda _, change: derivative(change), change)
 
     growth = largest_growth(derivative_twice, x, _ITERATIONS_FOR_FREQUENCY)
     oscillates = growth.along_itself < 0
+    # Changes grow by omega^2.
     return jnp.where(oscillates, jnp.exp(growth.log_growth / 2), 0)
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from .._batch import batched_like
 from .._custom_types import IntScalarLike
-from .linear import correction
+from .linear import correction, NewtonCorrection
 from .tolerance import all_finite, converged, largest, log2, max_norm, ratio, Tolerance
 
 
@@ -126,45 +126,61 @@ class Newton(eqx.Module):
             return (1 - s) * (k - self.start) + s * self.residual(k)
 
         newton = correction(equations, k, self.linear_solver)
-        size_of_iterate = max_norm(k)
         next_k = k - newton.change
         scale = self.scale(self.restore(next_k))
         correction_size = self.tolerance.measure(self.restore(newton.change), scale)
         size = correction_size.size
-        tries = progress.tries + 1
         # The first correction has none to be compared with.
         shrinkage = jnp.where(progress.tries > 0, ratio(size, progress.size), 1)
-        level = log2(size)
-        rate = log2(shrinkage)
-        is_at_rounding = shrinkage >= _SHRINK_AT_ROUNDING
         has_converged = converged(
-            level, rate, correction_size.is_rounding, has_stalled=is_at_rounding
+            log2(size),
+            log2(shrinkage),
+            correction_size.is_rounding,
+            has_stalled=shrinkage >= _SHRINK_AT_ROUNDING,
         )
-        # Far from any solution, rounding errors of a large Jacobian can hide the unknowns
-        # with small coefficients. Corrections are then small, but residuals exceed the
-        # state.
+        size_of_iterate = max_norm(k)
+        is_correct = self._is_correct(newton, next_k, scale, size_of_iterate)
+        is_solved = has_converged & is_whole_step & is_correct
+        is_near = max_norm(newton.change) < _LOOSE * size_of_iterate
+        part_is_solved = is_near & ~is_whole_step
+        progress = progress._replace(
+            tries=progress.tries + 1, size=size, is_solved=is_solved
+        )
+        has_failed = _cannot_go_on(progress, shrinkage) & ~part_is_solved & ~is_solved
+        return _next_target(progress, next_k, part_is_solved, has_failed)
+
+    def _is_correct(
+        self,
+        newton: NewtonCorrection,
+        next_k: _Vector,
+        scale: PyTree[Array],
+        size_of_iterate: Scalar,
+    ) -> Bool[Array, ""]:
+        """Whether a small correction is that of a solution: whether its linear system was
+        solved, and the residual is no larger than the state.
+
+        Far from any solution, rounding errors of a large Jacobian can hide the unknowns
+        with small coefficients. Corrections are then small, but not the residual."""
         size_of_scale = largest([max_norm(x) for x in jtu.tree_leaves(scale)])
         allowed_residual = jnp.maximum(size_of_scale, size_of_iterate)
         allowed_residual = allowed_residual + self.tolerance.atol
         residual_fits = max_norm(newton.residual) <= allowed_residual
-        is_correct = newton.found & residual_fits & all_finite(next_k)
-        is_solved = has_converged & is_whole_step & is_correct
+        return newton.found & residual_fits & all_finite(next_k)
 
-        # The whole step at once is tried first, from a guess that may be poor. The last
-        # part of a continuation begins near a solution, or fails soon.
-        is_first_try = is_whole_step & (progress.reached == 0)
-        patience = jnp.where(is_first_try, _PATIENCE, _FEWEST_TO_COMPARE)
-        # A zero correction away from a solution is no progress either.
-        is_due = tries >= patience
-        makes_progress = (shrinkage < _SHRINK) & (size > 0)
-        has_stopped = is_due & ~makes_progress
-        is_slow = ~is_whole_step & (tries >= _PATIENCE_IN_PART)
-        is_near = max_norm(newton.change) < _LOOSE * size_of_iterate
-        part_is_solved = is_near & ~is_whole_step
-        cannot_go_on = ~jnp.isfinite(size) | has_stopped | is_slow
-        has_failed = cannot_go_on & ~part_is_solved & ~is_solved
-        progress = progress._replace(tries=tries, size=size, is_solved=is_solved)
-        return _next_target(progress, next_k, part_is_solved, has_failed)
+
+def _cannot_go_on(progress: Progress, shrinkage: Scalar) -> Bool[Array, ""]:
+    """Whether further iterations would not reach the target: where the last correction is
+    not finite, is not smaller than the one before by enough, or is one of too many."""
+    is_whole_step = progress.target == 1
+    # The whole step at once is tried first, from a guess that may be poor. The last part of
+    # a continuation begins near a solution, or fails soon.
+    is_first_try = is_whole_step & (progress.reached == 0)
+    patience = jnp.where(is_first_try, _PATIENCE, _FEWEST_TO_COMPARE)
+    # A zero correction away from a solution is no progress either.
+    makes_progress = (shrinkage < _SHRINK) & (progress.size > 0)
+    has_stopped = (progress.tries >= patience) & ~makes_progress
+    is_slow = ~is_whole_step & (progress.tries >= _PATIENCE_IN_PART)
+    return ~jnp.isfinite(progress.size) | has_stopped | is_slow
 
 
 def _next_target(

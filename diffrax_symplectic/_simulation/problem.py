@@ -45,12 +45,11 @@ from .._terms import (
     NEED_VALUES,
     step_variables,
     StepVariables,
-    truncated_in_unit,
     which_are_shapes,
     which_need_truncation,
     with_paths_for_shapes,
     with_programs,
-    without_truncation,
+    with_truncation,
 )
 from .arguments import (
     check_cells,
@@ -193,14 +192,17 @@ class Problem(eqx.Module):
         if constraint_of(terms) is not None:
             check_start(terms, t0_of_dtype, y0, args)
         check_noise(terms)
-        if any(is_made_by_solver):
-            needs_truncation = which_need_truncation(terms, t0_of_dtype, y0, args)
+        if isinstance(solver, diffrax.AbstractImplicitSolver) and any(
+            is_made_by_solver
+        ):
+            needed = which_need_truncation(terms, t0_of_dtype, y0, args)
+            # Paths of the user are kept as they are.
+            which = [
+                is_made and need for is_made, need in zip(is_made_by_solver, needed)
+            ]
             # All levels have the same unit. An array: another one compiles nothing anew.
             unit = _UNIT_OF_TRUNCATION * (float(t1) - float(t0))
-            unit = np.asarray(unit, t0_of_dtype.dtype)
-            terms = _truncated_where_needed(
-                terms, is_made_by_solver, needs_truncation, unit
-            )
+            terms = with_truncation(terms, which, np.asarray(unit, t0_of_dtype.dtype))
         check_truncation(terms, float(dt0))
         smallest_step = float(dt0) / 2 ** (levels - 1)
         if isinstance(solver, AbstractSymplecticSolver):
@@ -414,24 +416,6 @@ def _room_for_steps(finest_steps: int, levels: int) -> int:
 def _number_as_array(x: Any) -> Any:
     """A number of Python as an array. Integers are kept: they may be exponents or sizes."""
     return jnp.asarray(x) if type(x) is float else x
-
-
-def _truncated_where_needed(
-    terms: PyTree[diffrax.AbstractTerm],
-    is_made_by_solver: Sequence[bool],
-    needs_truncation: Sequence[bool],
-    unit: np.ndarray,
-) -> PyTree[diffrax.AbstractTerm]:
-    """The terms with truncation, in this unit of time, in those paths that a solver makes
-    and that need it, and without in those that do not. A solver makes a path without
-    knowing what it drives, and truncates its increments to be safe. Paths of the user are
-    kept as they are."""
-    is_truncated_needlessly = [
-        is_made and not needs
-        for is_made, needs in zip(is_made_by_solver, needs_truncation)
-    ]
-    terms = without_truncation(terms, is_truncated_needlessly)
-    return truncated_in_unit(terms, is_made_by_solver, unit)
 
 
 def advice_on_failures(has_bounded_increments: bool, is_implicit: bool) -> str:

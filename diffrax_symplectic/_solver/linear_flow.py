@@ -142,22 +142,27 @@ def _modes_of(
     is_known = not is_traced(K) and not is_traced(mass_roots)
     xp: Any = np if is_known else jnp
     if is_known:
-        largest_entry = np.max(abs(K), initial=0)
-        if np.max(abs(K - K.T), initial=0) > _TOLERANCE * largest_entry:
-            raise ValueError(
-                "`stiffness` must be symmetric: it is a second derivative."
-            )
+        _check_symmetric(K)
     root_of_each = xp.broadcast_to(xp.asarray(mass_roots), shape_of_q).reshape(-1)
-    squares, vectors = xp.linalg.eigh(K / root_of_each[:, None] / root_of_each)
-    rounding = _TOLERANCE * xp.max(abs(squares), initial=0)
-    if is_known and np.min(squares, initial=0) < -rounding:
+    # The eigenvalues are the squares of the frequencies.
+    eigenvalues, vectors = xp.linalg.eigh(K / root_of_each[:, None] / root_of_each)
+    rounding = _TOLERANCE * xp.max(abs(eigenvalues), initial=0)
+    least = xp.min(eigenvalues, initial=0)
+    if is_known and least < -rounding:
         raise ValueError(
-            f"`stiffness` has the negative eigenvalue {np.min(squares):.2g} (over masses): "
-            "the rest is no minimum. Leave this part to `slow=`."
+            f"`stiffness` has the negative eigenvalue {least:.2g} (over masses): there is "
+            "no minimum of the energy at rest. Leave this part to `slow=`."
         )
-    squares = xp.where(abs(squares) < rounding, 0.0, squares)
+    eigenvalues = xp.where(abs(eigenvalues) < rounding, 0.0, eigenvalues)
     # The root of a negative eigenvalue that is traced is NaN, which makes paths fail.
-    return jnp.asarray(xp.sqrt(squares)), jnp.asarray(vectors)
+    return jnp.asarray(xp.sqrt(eigenvalues)), jnp.asarray(vectors)
+
+
+def _check_symmetric(K: Float[np.ndarray, "n n"]) -> None:
+    """Raises a `ValueError` unless the stiffness is symmetric up to rounding."""
+    largest_entry = np.max(abs(K), initial=0)
+    if np.max(abs(K - K.T), initial=0) > _TOLERANCE * largest_entry:
+        raise ValueError("`stiffness` must be symmetric: it is a second derivative.")
 
 
 def _to_modes(

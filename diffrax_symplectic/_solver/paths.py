@@ -13,6 +13,7 @@ from .._brownian import (
     LevyAreaIncrement,
     PlateauBrownianPath,
     PlateauIncrement,
+    TruncatedBrownianPath,
 )
 from .base import AbstractSymplecticSolver
 from .record import Want
@@ -22,11 +23,13 @@ def own_path(
     solver: diffrax.AbstractSolver, want: Want, shape: PyTree, key: PRNGKeyArray
 ) -> diffrax.AbstractBrownianPath:
     """The path `solver.path(shape, key)` of a solver of this package, or for any other
-    solver a Gaussian path."""
+    solver a Gaussian path. It is not truncated: whether it needs that depends on the terms,
+    and is seen by `which_need_truncation`."""
     # `isinstance` would look through a `diffrax.HalfSolver`.
-    if issubclass(type(solver), AbstractSymplecticSolver):
-        return cast(AbstractSymplecticSolver, solver).path(shape, key, want=want)
-    return common_path(solver, cell=None, shape=shape, key=key)
+    if not issubclass(type(solver), AbstractSymplecticSolver):
+        return common_path(solver, cell=None, shape=shape, key=key)
+    path = cast(AbstractSymplecticSolver, solver).path(shape, key, want=want)
+    return path.path if isinstance(path, TruncatedBrownianPath) else path
 
 
 def common_path(

@@ -179,9 +179,8 @@ def _loop(
     def whole_state(entries: Iterable[Any]) -> list[Tensor]:
         return elements_of_both(changes, tensors_from(entries, shapes), constants)
 
-    # Beside the entries, Dr.Jit's loop has in its state the mask of the lanes that failed
-    # so far.
-
+    # The mask of the lanes that failed so far is part of the state of Dr.Jit's loop, which
+    # returns nothing else.
     def goes_on(failed: Any, *entries: Any) -> Any:
         (condition,), fails_now = operation.with_failures(
             lambda: operation.run(_CONDITION, whole_state(entries))
@@ -203,11 +202,10 @@ def _loop(
         body=iterate,
         mode="symbolic",
     )
-    # Constants are made anew, as in `_conditional`.
     failed, *entries = map(as_own_literal, results)
     operation.fail(failed)
     state_at_end = whole_state(entries)
-    # A loop of Dr.Jit does not return the lanes that fail in its condition. They stopped
-    # there, so that the condition at the end marks them once more.
+    # What fails in the last test of the condition is not in the state. The condition is run
+    # once more, to fail in these lanes; its value is not used.
     operation.run(_CONDITION, state_at_end)
     return state_at_end

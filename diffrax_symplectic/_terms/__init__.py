@@ -46,8 +46,8 @@ from .step_variables import outcomes, step_variables, StepVariables
 from .structure import additive_fault, check_assertions, check_baths_have_own_noise
 from .structure import check_drifts_differ, check_stratonovich, check_structure
 from .structure import constant_fault, Fault, FRICTION, noises_commute
-from .structure import separable_fault, truncated_in_unit
-from .structure import which_need_truncation, without_truncation
+from .structure import separable_fault
+from .structure import which_need_truncation, with_truncation
 from .symplectic_gradients import IndexedNoise, slow_apart
 from .vector_fields import apply, apply_one, check_terms_fit_state, rate, tree_sum
 from .waves import from_pair, to_pair, wave_terms

@@ -187,16 +187,17 @@ def is_off_order(last: Any, miss: Any, miss_error: Any) -> np.ndarray:
 
 
 def remaining_error(
-    extrapolation: Any, by_first_power: Any, noise: Any
+    change: Any, change_by_first_power: Any, std_error: Any
 ) -> np.ndarray | np.floating:
-    """An estimate of the discretization error that remains, from the change by the last
-    `extrapolation`, and from this change as it were if it eliminated the first power of the
-    step size only, with its standard error, `noise`.
+    """An estimate of the discretization error that remains after the last extrapolation.
 
-    (By the former alone, of harmonic oscillators over long times by four and five levels, 5
-    to 12% of the means were more than two error bars off; by both it is 0 to 2%.)"""
-    sure = np.abs(by_first_power) - _ERRORS_BY_CHANCE * noise
-    return np.maximum(np.abs(extrapolation), sure)
+    It is the larger of two: the `change` by this extrapolation, and the change that it
+    would make if it eliminated the first power of the step size only, as far as this is
+    more than its noise, by its `std_error`."""
+    # By the former alone, of harmonic oscillators over long times by four and five levels,
+    # 5 to 12% of the means were more than two error bars off; by both it is 0 to 2%.
+    least_change = np.abs(change_by_first_power) - _ERRORS_BY_CHANCE * std_error
+    return np.maximum(np.abs(change), least_change)
 
 
 def largest_if_off_order(

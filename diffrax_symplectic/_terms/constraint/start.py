@@ -46,11 +46,13 @@ _OFF = (
 def check_start(
     terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Raises a `ValueError` if the constraints are dependent at `y0`, if `y0` is off them,
-    or if no solver takes them. Returns the first two as flags: what is not known while
-    tracing is an error when run, but in a batch only the flag of its path."""
+    """Raises a `ValueError` unless masses are constant, if the constraints are dependent at
+    `y0`, or if `y0` is off them.
+
+    Returns the last two as flags. Of traced values a flag that is true raises an error when
+    run, unless it is that of a path in a batch, which then has to fail."""
     _check_constant_masses(terms, t0, y0, args)
-    # A check has no derivative. Taking one would trace it again.
+    # Under `grad` a derivative of the flags would be traced, which is zero.
     fixed_y0, fixed_args = jtu.tree_map(_without_derivative, (y0, args))
     is_dependent, is_off = _start_faults(terms, t0, fixed_y0, fixed_args)
     return refused_where(is_dependent, _DEPENDENT), refused_where(is_off, _OFF)

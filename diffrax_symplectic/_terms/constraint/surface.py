@@ -184,21 +184,22 @@ class Surface(NamedTuple):
         momentum_is_tangent = max_norm(normal_part) <= bound * max_norm(p)
         return ~(position_is_on & momentum_is_tangent)
 
-    def _size_by_curvature(self, normal_space: NormalSpace) -> Multipliers:
-        """The size of the numbers of which each constraint is a difference, by its
-        curvature: its gradient times its radius of curvature.
+    def _size_by_curvature(self, normal_space: NormalSpace) -> Float[Array, " c"]:
+        r"""The size of the terms that cancel in each constraint $g$, such as one for $q^2
+        - 1$: its gradient times its radius of curvature, $|g'| \cdot |g'| / |g''|$, with
+        $g''$ along an arbitrary direction. Zero for a plane.
 
         A constraint rounds as its positions do, or, where these are near the origin, as
-        numbers of the size of that radius do.
+        these terms do.
         """
         q = normal_space.q
-        # Gradients are differentiated along a direction that no symmetry singles out.
+        # No symmetry singles out this direction.
         direction = jnp.cos(1.0 + jnp.arange(len(q), dtype=q.dtype))
-        _, changes = jax.jvp(jax.jacrev(self.residual), (q,), (direction,))
-        # Of shape (constraints, positions), summed over the positions.
-        gradient_changes = jnp.sum(jnp.abs(changes), axis=1)
-        squares = jnp.sum(normal_space.normals**2, axis=1)
-        return squares / jnp.where(gradient_changes > 0, gradient_changes, jnp.inf)
+        _, gradient_changes = jax.jvp(jax.jacrev(self.residual), (q,), (direction,))
+        # Both are sums over the positions, the last axis.
+        curvatures = jnp.sum(jnp.abs(gradient_changes), axis=1)
+        squared_gradients = jnp.sum(normal_space.normals**2, axis=1)
+        return squared_gradients / jnp.where(curvatures > 0, curvatures, jnp.inf)
 
 
 def _rounding(normal_space: NormalSpace, q: Vector) -> Multipliers:

@@ -17,4 +17,4 @@ from .checks import (
 from .checks import constant_fault, Fault, FRICTION, separable_fault
 from .commuting import noises_commute
 from .said_twice import check_baths_have_own_noise, check_drifts_differ
-from .truncation import truncated_in_unit, which_need_truncation, without_truncation
+from .truncation import which_need_truncation, with_truncation

@@ -63,7 +63,7 @@ class Fault(NamedTuple):
     - `cause`: what is wrong, as a part of a sentence.
     - `advice`: what to do, in sentences.
     - `friction`: whether all that is wrong is a force of plain terms that depends on the
-        momentum, such as friction.
+        momentum, such as friction; with `wrong_way_round`, after the exchange.
     - `wrong_way_round`: whether nothing else would be wrong with the halves of the state
         exchanged.
     """
@@ -147,23 +147,22 @@ def separable_fault(
     drift_traces = trace((*frictionless, *friction))
     noise_traces = trace(noise)
     leaves_unchanged = ft.partial(_leaves_unchanged, t0, y0, args)
-    faults = _separable_faults(0, drift_traces, noise_traces, leaves_unchanged)
+    faults, faults_if_exchanged = [
+        _separable_faults(momentum_half, drift_traces, noise_traces, leaves_unchanged)
+        for momentum_half in (0, 1)
+    ]
     if len(faults) == 0:
         return None
-    # The faults that remain for (position, velocity), the order of many other packages.
-    exchanged = _separable_faults(1, drift_traces, noise_traces, leaves_unchanged)
-    only_friction = all(fault.friction for fault in faults)
-    wrong_way_round = not only_friction and all(fault.friction for fault in exchanged)
-    if wrong_way_round:
-        only_friction = len(exchanged) > 0
     first = faults[0]
-    advice = f"{FRICTION} {first.advice}" if only_friction else first.advice
-    return Fault(
-        cause=first.cause,
-        advice=advice,
-        friction=only_friction,
-        wrong_way_round=wrong_way_round,
-    )
+    with_friction = first._replace(advice=f"{FRICTION} {first.advice}", friction=True)
+    if all(fault.friction for fault in faults):
+        return with_friction
+    if len(faults_if_exchanged) == 0:
+        return first._replace(friction=False, wrong_way_round=True)
+    # For (position, velocity), the order of many other packages, only friction is wrong.
+    if all(fault.friction for fault in faults_if_exchanged):
+        return with_friction._replace(wrong_way_round=True)
+    return first._replace(friction=False)
 
 
 class _Traced(NamedTuple):

@@ -6,7 +6,7 @@ import diffrax
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from ..._brownian import TruncatedBrownianPath
+from ..._brownian import FixedStepBrownianPath, TruncatedBrownianPath
 from ..._compat import unwrapped
 from ..._custom_types import Args, RealScalarLike, Y
 from ..._programs import once_for_each_signature
@@ -47,37 +47,23 @@ def _depends_on_state(
     return additive_fault((term,), t0, y0, args) is not None
 
 
-def without_truncation(
-    terms: PyTree[diffrax.AbstractTerm], which: Sequence[bool] | None = None
-) -> PyTree[diffrax.AbstractTerm]:
-    """The terms with the path within each truncated path in its place; or only in place of
-    those paths whose flag in `which`, with one for each path, is true."""
-    if which is None:
-        which = [True] * len(brownian_paths(terms))
-    remaining_flags = iter(which)
-
-    def new_path(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
-        is_wanted = next(remaining_flags)
-        if is_wanted and isinstance(path, TruncatedBrownianPath):
-            return path.path
-        return path
-
-    return replace_paths(terms, new_path)
-
-
-def truncated_in_unit(
+def with_truncation(
     terms: PyTree[diffrax.AbstractTerm],
     which: Sequence[bool],
-    unit: Float[np.ndarray, ""],
+    unit: Float[np.ndarray, ""] | None = None,
 ) -> PyTree[diffrax.AbstractTerm]:
-    """The terms with this `unit` of time in those truncated paths whose flag in `which`,
-    with one for each path, is true."""
+    """The terms with truncation, in this `unit` of time, in those paths of Gaussian
+    increments alone whose flag in `which`, with one for each path, is true."""
     remaining_flags = iter(which)
 
     def new_path(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
         is_wanted = next(remaining_flags)
-        if is_wanted and isinstance(path, TruncatedBrownianPath):
-            return TruncatedBrownianPath(path.path, k=path.k, unit=unit)
+        has_increments_alone = (
+            isinstance(path, FixedStepBrownianPath)
+            and path.levy_area is diffrax.BrownianIncrement
+        )
+        if is_wanted and has_increments_alone:
+            return TruncatedBrownianPath(path, unit=unit)
         return path
 
     return replace_paths(terms, new_path)
