@@ -127,10 +127,10 @@ def check_solver(name: str, solver: Any) -> None:
 
 def check_made_for_noise(solver: diffrax.AbstractSolver) -> None:
     """Raises a `ValueError` for solvers of Diffrax that are for equations without noise, or
-    that wrap another one."""
+    that wrap another one. Solvers of others need not say which equations they are for."""
     kinds = diffrax.AbstractItoSolver | diffrax.AbstractStratonovichSolver
     is_of_diffrax = type(solver).__module__.startswith("diffrax.")
-    # `isinstance` would look through a `diffrax.HalfSolver`.
+    # For `isinstance` a `diffrax.HalfSolver` is of the kind of the solver in it.
     if is_of_diffrax and not issubclass(type(solver), kinds):
         raise ValueError(
             "`solver` must take fixed steps and be for equations with noise, as those of "

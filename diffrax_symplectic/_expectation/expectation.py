@@ -261,7 +261,9 @@ def expectation(
                 estimate = dataclasses.replace(estimate, caveat=trial.caveat)
                 messages += [] if trial.message is None else [trial.message]
             if has_kinks(problem):
-                messages += _messages_on_law(estimate, problem, key, devices)
+                messages += _messages_on_discrete_increments(
+                    estimate, problem, key, devices
+                )
             for message in messages:
                 warnings.warn(message, stacklevel=2)
             warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
@@ -288,11 +290,12 @@ def messages_on_steps(problem: Problem, dt0: float) -> list[str]:
     return [message for message in told if message is not None]
 
 
-def _messages_on_law(
+def _messages_on_discrete_increments(
     estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: Devices
 ) -> list[str]:
-    """Whether discrete increments change the mean of a `phi` that may not be smooth, by a
-    trial with Gaussian increments."""
+    """What is wrong with the mean of a `phi` that may not be smooth if increments are
+    discrete, as sentences, one at most: by a trial with Gaussian increments, or without a
+    trial if the solver takes no others."""
     paths = random_paths(problem.terms)
     laws = [law for path in paths for law in (laws_of(path) or {}).values()]
     if not any(isinstance(law, Discrete) for law in laws):

@@ -204,15 +204,19 @@ def _changes_by_same_sampling(
     """The changes on samples of the same kind with half the steps; `None` if too many
     fail."""
     assert plan.with_half_steps is not None
-    # A batch takes as long, however few of its samples count. Two have a mean at least.
+    # At least two samples, for a standard error; and a whole batch, since a part of one
+    # takes as long.
     num_samples = max(2, plan.batch_size, int(_FIRST_SHARE * estimate.num_samples))
-    plan = plan.with_half_steps()._replace(num_samples=num_samples)
-    trial = run(plan, key, devices)
+    trial_plan = plan.with_half_steps()._replace(
+        num_samples=num_samples, is_quick=plan.is_quick
+    )
+    trial = run(trial_plan, key, devices)
     if trial.num_failed > _MOST_FAILED * num_samples * plan.paths_per_sample:
         return None
     own = estimate.vectors
     other = trial.vectors
-    # Two samples hardly know their own spread, which is about that of the estimate's.
+    # So few samples may show a standard error that is far too small. It is taken to be at
+    # least that of the estimate, scaled to their number.
     expected = own.std_error * np.sqrt(estimate.num_samples / num_samples)
     return _Changes(
         sizes=np.abs(other.mean - own.mean),
@@ -251,8 +255,12 @@ def _with_finer_level(problem: Problem, key: PRNGKeyArray) -> Problem:
     levels = with_next_level(problem.levels)
     finest = levels.h[-1]
     terms = problem.terms
-    has_same_noise = not has_discrete_increments(problem.solver)
-    if has_same_noise and is_multiple(float(problem.t0), float(finest)):
+    # All levels have the same noise by paths that are sampled over cells of the finest
+    # step, if these begin at multiples of it, and the solver takes Gaussian increments.
+    # Otherwise the levels have independent noise.
+    begins_at_cell = is_multiple(float(problem.t0), float(finest))
+    if begins_at_cell and not has_discrete_increments(problem.solver):
+        # An array, so that another cell compiles nothing anew.
         path = ft.partial(path_of_array_cell, problem.solver, np.asarray(finest))
         numbers = motion_numbers(random_paths(terms))
         terms = with_paths(path, numbers, terms, key)

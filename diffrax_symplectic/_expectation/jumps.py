@@ -100,12 +100,14 @@ def jumps_within_steps(problem: Problem) -> str | None:
     if steps is None:
         return None
     times = _times_of_jumps(field, problem, steps)
+    # A jump that another draw of `args` does not have is at a random time of each path.
     if problem.args_of is not None and times.size:
         other_args = problem.with_args(problem.draw_start(jr.key(2)).args).args
         other_field = all_fields(problem, other_args)
         others = _times_of_jumps(other_field, problem, steps)
-        is_same = np.abs(times[:, None] - others) < steps.far
-        times = times[np.any(is_same, axis=1)]
+        are_equal = np.abs(times[:, None] - others) < steps.far
+        is_in_both = np.any(are_equal, axis=1)
+        times = times[is_in_both]
     if not times.size:
         return None
     return (

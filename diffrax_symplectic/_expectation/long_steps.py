@@ -190,7 +190,7 @@ def unresolved_noise(problem: Problem, dt0: float) -> str | None:
     start, as a sentence; `None` if nothing is, or for solvers of others."""
     if not isinstance(problem.solver, AbstractSymplecticSolver):
         return None
-    if not _has_step_without_noise(problem) or not _has_noise_of_state(problem):
+    if not _has_step_without_noise(problem) or not _noise_reads_state(problem):
         return None
     angle = float(_quick_noise_frequency(problem)) * dt0**0.5
     if not angle > _MOST_TURNED_BY_NOISE:
@@ -210,8 +210,9 @@ def _noise_of_user(problem: Problem) -> Terms:
 
 
 @once_for_each_signature
-def _has_noise_of_state(problem: Problem) -> bool:
-    """Whether noise reads the state, by its dependence, not by its values."""
+def _noise_reads_state(problem: Problem) -> bool:
+    """Whether the change of the state by noise, but that of heat baths, reads the state in
+    its program. (At `y0` it may read it to no effect.)"""
     noise = _noise_of_user(problem)
     if not noise:
         return False

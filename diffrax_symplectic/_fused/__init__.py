@@ -19,4 +19,4 @@ sizes, and numbers of steps and paths.
 
 from .kernels import Kernels, Lanes, Shared
 from .path_functions import PathFunctions, sample_key, functions_and_arrays
-from .sweeps import without_rescue
+from .sweeps import by_sweeps_alone

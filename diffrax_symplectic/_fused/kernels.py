@@ -288,26 +288,27 @@ class Kernels:
                 constants=constants,
             )
             *states, success = results
-            # LLVM schedules by the order: with the success first, a step of `StormerVerlet`
-            # in single precision takes 1.13 times as long, and of Heun's method 0.85.
+            # The order decides how LLVM schedules operations: with the success first, a
+            # step of `StormerVerlet` in single precision takes 1.13 times as long, and of
+            # Heun's method 0.85.
             for failed in (*error_masks, ~success.item()):
                 stopped = stopped | failed
             new_y = states[: len(y_tensors)]
             new_solver_state = states[len(y_tensors) :]
             new_moving = elements_where(new_solver_state, self._is_moving)
             new_entries = [*entries_of(new_y), *entries_of(new_moving)]
-            # A path that stopped stays where it was: its numbers could be NaN, with which
-            # sweeps end last.
+            # A path that stopped stays where it was: sweeps over NaN would go on to the
+            # limit in every later step.
             kept = [select(stopped, old, new) for old, new in zip(entries, new_entries)]
             return i + 1, stopped, *kept
 
         state_at_start = (first_step, stopped, *y, *solver_state)
-        _, stopped, *entries = drjit().while_loop(
+        _, has_stopped, *entries = drjit().while_loop(
             state_at_start, has_more_steps, after_step, mode="symbolic"
         )
-        last_variable = max(map(variable_number, [stopped, *entries]))
+        last_variable = max(map(variable_number, [has_stopped, *entries]))
         _warn_of_operations(last_variable - first_variable)
-        return entries[: len(y)], entries[len(y) :], stopped
+        return entries[: len(y)], entries[len(y) :], has_stopped
 
 
 def _warn_of_operations(num_operations: int) -> None:

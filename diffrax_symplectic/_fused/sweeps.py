@@ -251,14 +251,18 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
         return state[0], aux, {}
 
 
-def without_rescue(solver: Any) -> Any:
-    """The solver, and all solvers in it, with `Sweeps` in place of `PicardNewton`."""
+def by_sweeps_alone(solver: Any) -> Any:
+    """The solver, and all solvers in it, with `Sweeps` in place of `PicardNewton`: without
+    Newton's method. Paths that fail are simulated again by JAX."""
 
-    def with_sweeps(stages: Any) -> Any:
-        _check_tolerance(stages.root_finder)
+    def with_sweeps(implicit: Any) -> Any:
+        _check_tolerance(implicit.root_finder)
         # Optimistix makes no iterations: `Sweeps` solves the equations before the first.
-        fields = lambda stages: (stages.root_finder, stages.root_find_max_steps)
-        return eqx.tree_at(fields, stages, (Sweeps(), 0))
+        return eqx.tree_at(
+            lambda solver: (solver.root_finder, solver.root_find_max_steps),
+            implicit,
+            (Sweeps(), 0),
+        )
 
     return with_changed_stages(solver, with_sweeps)
 

@@ -77,11 +77,11 @@ class _SweepState(NamedTuple):
 class _AfterSweeps(NamedTuple):
     """The result of the sweeps between two checks.
 
-    - `change`: the last correction.
+    - `correction`: the last correction.
     - `y`: the iterate.
     """
 
-    change: PyTree[Array]
+    correction: PyTree[Array]
     y: Halves
 
 
@@ -131,13 +131,14 @@ def solve_by_sweeps(
         return y if in_halves else y.q
 
     def sweep_and_check(state: _SweepState) -> _SweepState:
-        change, y = _sweep_until_check(image, state, in_halves)
-        correction = tolerance.measure(change, scale(value_of(y)))
-        # The first correction is bounded by the size of the state.
-        last_level = jnp.minimum(state.level, log2(correction.bound))
-        level = log2(correction.size)
+        correction, y = _sweep_until_check(image, state, in_halves)
+        size = tolerance.measure(correction, scale(value_of(y)))
+        # Before the first check the level is infinite: the size of the state stands for the
+        # correction before.
+        last_level = jnp.minimum(state.level, log2(size.bound))
+        level = log2(size.size)
         check = ft.partial(
-            _decide, state, level, last_level, correction, first_sweeps, max_sweeps
+            _decide, state, level, last_level, size, first_sweeps, max_sweeps
         )
         # Without `materialize` the result would be recomputed wherever it is used: steps of
         # small systems took 1.3 to 2.8 times as long. The logarithms are inside, so that
@@ -145,8 +146,8 @@ def solve_by_sweeps(
         next_state, goes_back = materialize(check)
 
         # All paths of a batch sweep together, but a path that has ended stays where it was.
-        def next_iterate(y: Array, start: Array, old: Array) -> Array:
-            return jnp.where(state.pending, jnp.where(goes_back, start, y), old)
+        def next_iterate(new: Array, guess: Array, old: Array) -> Array:
+            return jnp.where(state.pending, jnp.where(goes_back, guess, new), old)
 
         return next_state._replace(y=jtu.tree_map(next_iterate, y, start, state.y))
 
@@ -217,18 +218,18 @@ def _decide(
     state: _SweepState,
     level: Scalar,
     last_level: Scalar,
-    correction: CorrectionSize,
+    size: CorrectionSize,
     first_sweeps: int,
     max_sweeps: int,
 ) -> _Decision:
-    """What to do next, after a correction of this size. Its base-2 logarithm is `level`,
+    """What to do next, after a correction of this `size`. Its base-2 logarithm is `level`,
     and that of the correction at the last check is `last_level`. `first_sweeps` is the
     number of sweeps before the first check, and `max_sweeps` the most in all."""
     # The rate is a base-2 logarithm, so that the number of further sweeps is a quotient.
     rate = (level - last_level) / state.num_ahead
     num_done = state.num_done + state.num_ahead
     has_stalled = rate >= LOG2_STALLED
-    has_converged = converged(level, rate, correction.is_rounding, has_stalled)
+    has_converged = converged(level, rate, size.is_rounding, has_stalled)
     # Sweeps that diverged get one more try. If it stalls, Newton's method takes over.
     starts_again = has_stalled & (state.relaxation > _STRONGEST_RELAXATION)
     ratio = jnp.exp2(rate)
@@ -244,11 +245,11 @@ def _decide(
     pending = state.pending & ~has_converged & in_time & (num_done < max_sweeps)
     # Newton's method begins where the sweeps ended if that is near a solution, or else at
     # the guess.
-    is_near = ~has_stalled & (correction.is_small | pending)
+    is_near = ~has_stalled & (size.is_small | pending)
     num_ahead = jnp.where(starts_again, first_sweeps, num_needed)
     # Corrections as small as rounding errors show no rate.
     num_ahead = jnp.where(
-        correction.is_rounding, jnp.minimum(num_ahead, _MOST_AT_ROUNDING), num_ahead
+        size.is_rounding, jnp.minimum(num_ahead, _MOST_AT_ROUNDING), num_ahead
     )
     num_ahead = jnp.ceil(jnp.where(pending, num_ahead, 0)).astype(int)
     relaxation = jnp.where(is_tuned_now, best_relaxation(ratio), state.relaxation)

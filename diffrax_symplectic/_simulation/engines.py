@@ -18,13 +18,13 @@ from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .._arguments import check_untraced
 from .._fused import (
+    by_sweeps_alone,
     functions_and_arrays,
     Kernels,
     Lanes,
     PathFunctions,
     sample_key,
     Shared,
-    without_rescue,
 )
 from .._lapack import lapack_in_turn
 from .._programs import compiled
@@ -236,7 +236,7 @@ def _compiled_problem(problem: Problem) -> Problem:
     )
     return dataclasses.replace(
         problem,
-        solver=without_rescue(problem.solver),
+        solver=by_sweeps_alone(problem.solver),
         y0_of=None,
         args_of=None,
         levels=level,

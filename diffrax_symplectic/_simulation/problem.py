@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree
 
 from .._arguments import (
     check_args,
@@ -31,7 +31,7 @@ from .._arguments import (
 from .._brownian import has_bounded_increments
 from .._compat import is_traced
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
-from .._programs import digest, traced
+from .._programs import digest, once_for_each_signature, traced
 from .._root_finder import all_finite
 from .._solver import AbstractSymplecticSolver, check_resolution, own_path, Want
 from .._terms import (
@@ -163,27 +163,29 @@ class Problem(eqx.Module):
         # Times have the dtype of the state.
         t0_of_dtype = np.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
 
-        def programs(args: Args) -> tuple[Any, ...]:
-            """All functions that are called with `args`, as programs, and these `args`."""
+        def programs_for(args: Args) -> _Programs:
             draw_y0 = None
             if y0_of is not None:
                 draw = ft.partial(drawn_state, y0_of)
                 draw_y0 = traced(draw, key, args, identity=y0_of)
-            return (
-                traced_phi(phi, terms, t0_of_dtype, y0, args),
-                with_programs(terms, t0_of_dtype, y0, args),
-                with_programs(solver, t0_of_dtype, y0, args),
-                draw_y0,
-                args,
+            return _Programs(
+                phi=traced_phi(phi, terms, t0_of_dtype, y0, args),
+                terms=with_programs(terms, t0_of_dtype, y0, args),
+                solver=with_programs(solver, t0_of_dtype, y0, args),
+                y0_of=draw_y0,
+                args=args,
             )
 
         # Other numbers compile nothing anew if they are in arrays. But a function may need
         # the values of numbers of Python, in an `if`.
         try:
-            with_arrays = programs(jtu.tree_map(_number_as_array, args))
+            programs = programs_for(jtu.tree_map(_number_as_array, args))
         except (ValueError, *NEED_VALUES):
-            with_arrays = None
-        phi, terms, solver, y0_of, args = with_arrays or programs(args)
+            programs = None
+        # Outside of the `except`, since an error there would name both.
+        if programs is None:
+            programs = programs_for(args)
+        phi, terms, solver, y0_of, args = programs
         # What a function closes over shows in its program.
         check_untraced(f"`{caller}`", (phi, terms, solver, y0_of, args_of))
         check_fit(terms, t0_of_dtype, y0, args)
@@ -357,7 +359,13 @@ class Problem(eqx.Module):
 
     @property
     def _struct_of_phi(self) -> PyTree[jax.ShapeDtypeStruct]:
-        return jax.eval_shape(lambda: self.phi(self.t0, self.y0, self.args))
+        struct, _ = _structs_of_values(self.phi, self.t0, self.y0, self.args)
+        return struct
+
+    @property
+    def _struct_of_values(self) -> jax.ShapeDtypeStruct:
+        _, struct = _structs_of_values(self.phi, self.t0, self.y0, self.args)
+        return struct
 
     def unravel(self, x: Float[Array, "*axes m"]) -> PyTree[Array]:
         """Vectors of all numbers of `phi`, as from `values`, in the structure of `phi`,
@@ -380,7 +388,7 @@ class Problem(eqx.Module):
     @property
     def dtype_of_values(self) -> Any:
         """The dtype of `values`."""
-        return jax.eval_shape(lambda: self.values(self.t0, self.y0)).dtype
+        return self._struct_of_values.dtype
 
     @property
     def dtype(self) -> Any:
@@ -395,8 +403,20 @@ class Problem(eqx.Module):
     @property
     def output_shape(self) -> tuple[int, int]:
         """The number `S` of times at which to average, and `m` of components of `phi`."""
-        m = jax.eval_shape(lambda: self.values(self.t0, self.y0)).size
-        return self.levels.saved_steps.shape[1], m
+        return self.levels.saved_steps.shape[1], self._struct_of_values.size
+
+
+@once_for_each_signature
+def _structs_of_values(
+    phi: Callable[..., PyTree[ArrayLike]], t0: Array, y0: Y, args: Args
+) -> tuple[PyTree[jax.ShapeDtypeStruct], jax.ShapeDtypeStruct]:
+    """The shapes and dtypes of `phi`, and of all its numbers as one vector."""
+
+    def as_tree_and_vector() -> tuple[PyTree[Array], Array]:
+        value = phi(t0, y0, args)
+        return value, real_vector(value)
+
+    return jax.eval_shape(as_tree_and_vector)
 
 
 def _order_of(solver: diffrax.AbstractSolver, terms: PyTree) -> int | float:
@@ -411,6 +431,17 @@ def _room_for_steps(finest_steps: int, levels: int) -> int:
     most = 2 * finest_steps if levels == 2 else finest_steps
     # Powers of two, so that most other numbers of steps compile nothing anew.
     return 1 << (most - 1).bit_length()
+
+
+class _Programs(NamedTuple):
+    """The functions of a problem, each traced once with these `args`, so that what it
+    closes over is known. The fields are those of `Problem`."""
+
+    phi: Any
+    terms: PyTree[diffrax.AbstractTerm]
+    solver: diffrax.AbstractSolver
+    y0_of: Any
+    args: Args
 
 
 def _number_as_array(x: Any) -> Any:

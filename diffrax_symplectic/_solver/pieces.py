@@ -231,6 +231,7 @@ class Flow(AbstractPiece):
             setting.args,
             flow_state,
         )
+        # With a constraint the step fails unless all is `found`, and otherwise by `result`.
         found = moving.found
         if setting.surface is not None:
             found = found & (result == diffrax.RESULTS.successful)
@@ -326,7 +327,10 @@ def _rounded(elapsed: float) -> float:
 def lengths_and_times(
     pieces: tuple[AbstractPiece, ...], t0: RealScalarLike, t1: RealScalarLike
 ) -> tuple[dict[float, RealScalarLike], dict[float, RealScalarLike]]:
-    """The `lengths` and `times` of a `Setting`, for a step from `t0` to `t1`."""
+    """The `lengths` and `times` of a `Setting`, for a step from `t0` to `t1` of size `h`.
+
+    `lengths[s]` is `s h`, for the share of each piece and for each sum of shares;
+    `times[s]` is `t0 + s h` for each of these sums, and exactly `t1` at the end."""
     h = t1 - t0
     lengths: dict[float, Any] = {1.0: h}
     times: dict[float, Any] = {0.0: t0, 1.0: t1}

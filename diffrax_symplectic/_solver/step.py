@@ -186,15 +186,18 @@ class Stages(eqx.Module):
         """`scale` for the unknown values of one block."""
 
         def size(y: Array, value: Array) -> Array:
-            # With the value itself, a step from rest has a scale, too.
+            # At rest the state may be zero, and the value alone is the scale. The state
+            # broadcasts against the values of several stages.
             return jnp.abs(y) + jnp.abs(value)
 
-        def scale(group: Group, value: _Value) -> _Value:
-            changed_part = _part(self.y0, self.plan.tableau.stages[group[0]].writes)
-            return jtu.tree_map(size, changed_part, value)
+        def scale_of_group(group: Group, value: _Value) -> _Value:
+            # All stages of a group write the same part.
+            first = self.plan.tableau.stages[group[0]]
+            return jtu.tree_map(size, _part(self.y0, first.writes), value)
 
         return [
-            scale(group, value) for group, value in zip(block.unknown, unknown_of_block)
+            scale_of_group(group, value)
+            for group, value in zip(block.unknown, unknown_of_block)
         ]
 
     def _evaluate_group(self, group: Group, known: KnownValues) -> _Value:

@@ -234,12 +234,13 @@ def _erfc(a):
     size = _minimum(dr.abs(a), dtype(_ERFC_END))
     variable = (size - _ERFC_MIDDLE) / (size + _ERFC_MIDDLE)
     series = _erfc_series(_ERFC_DEGREES[dr.itemsize_v(a)])
-    smooth = _chebyshev_sum(series, variable)
-    # The rounding error of the square is the relative error of its exponential: near 26,
-    # 256 units in the last place. What was rounded off comes back as a factor.
+    g = _chebyshev_sum(series, variable)
+    # With the square rounded, `size^2 = square + rounded_off`, where the last number is
+    # small, so `exp(-size^2) = exp(-square) (1 - rounded_off)`. Near a size of 26 it is
+    # half a unit in the last place of 676, or 256 of one.
     square = size * size
     rounded_off = dr.fma(size, size, -square)
-    tail = dr.exp(-square) * (1 - rounded_off) * smooth / (1 + 2 * size)
+    tail = dr.exp(-square) * (1 - rounded_off) * g / (1 + 2 * size)
     return dr.select(_is_nan(a), a, dr.select(a < 0, 2 - tail, tail))
 
 

@@ -47,7 +47,8 @@ def step_variables(
     numbers: tuple[int, ...] | None = None,
 ) -> StepVariables:
     """The variables of a step of size `h`. `numbers` are the `motion_numbers` of the paths
-    of the terms, which programs, whose keys are traced, have to be told."""
+    of the terms. By default they are found by comparing keys; where keys are traced, they
+    have to be given."""
     paths = _paths_of_known_laws(terms)
     numbers = _checked_numbers(paths) if numbers is None else numbers
     # Paths with the same number are one Brownian motion, whose variables are drawn once.
@@ -62,6 +63,7 @@ def step_variables(
         given_paths = [
             motion.path_with(piece, h) for motion, piece in zip(motions, pieces)
         ]
+        # `replace_paths` visits paths in the order of `paths`.
         remaining_numbers = iter(numbers)
 
         def new_path(path: diffrax.AbstractBrownianPath) -> GivenPath:

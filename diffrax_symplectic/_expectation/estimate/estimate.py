@@ -278,7 +278,7 @@ class Expectation(eqx.Module):
 
     def __str__(self) -> str:
         lines = self._lines_of_means()
-        # Only the trials that choose a sampling have none themselves.
+        # Only trials, which no user sees, have no sampling.
         if self.levels == 1 and self.sampling is not None:
             lines.append("not included: the discretization error (see `levels`)")
         if self.vectors.is_off_order:
@@ -287,16 +287,16 @@ class Expectation(eqx.Module):
                 "is taken for the error (take smaller steps)"
             )
         plural = "" if self.levels == 1 else "s"
-        line = (
+        counts = (
             f"{self.num_paths:,} paths on {self.levels} level{plural}, "
             f"{self.num_failed:,} failed"
         )
         if self.tol_reached is not None and self.sampling is not None:
-            # Its size is an upper limit.
-            line += f", {type(self.sampling).__name__} until `tol`"
+            # With `tol` the size of the sampling is an upper limit, which tells nothing.
+            counts += f", {type(self.sampling).__name__} until `tol`"
         elif self.sampling is not None:
-            line += f", {self.sampling}"
-        lines.append(line)
+            counts += f", {self.sampling}"
+        lines.append(counts)
         if self.reason:
             lines.append(self.reason)
         if self.caveat:

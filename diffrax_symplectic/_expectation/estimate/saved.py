@@ -142,7 +142,7 @@ def fields_from(contents: Contents) -> dict[str, Any]:
     header, arrays = contents
     _check_counts(header)
     layout = Layout.of(_tree_of(header["structure"]), header["num_times"])
-    levels = len(header["ranges"][0][-1])
+    levels = _num_levels(header)
     # From three levels on, the combinations are the same.
     num_combinations = len(level_weights(1, min(levels, 3)))
     _check(bool(jnp.finfo(header["dtype"])))
@@ -190,8 +190,9 @@ def _check_counts(header: dict[str, Any]) -> None:
     """Raises a `ValueError` for numbers of samples and paths that no estimate has."""
     paths_per_sample = whole_number("paths_per_sample", header["paths_per_sample"])
     whole_number("rounding_floor", header["rounding_floor"])
-    levels = len(header["ranges"][0][-1])
+    levels = _num_levels(header)
     _check(levels > 0)
+    # Batches are in order, and do not overlap.
     end_before = 0
     for begin, end, num_good, num_failed, failed_on in header["ranges"]:
         whole_number("begin", begin, end_before)
@@ -203,6 +204,13 @@ def _check_counts(header: dict[str, Any]) -> None:
         for number in failed_on:
             whole_number("failed_on", number, 0, num_failed)
         end_before = end
+
+
+def _num_levels(header: dict[str, Any]) -> int:
+    """The number of levels, each of which has an entry in the `failed_on` of a batch."""
+    first_batch = header["ranges"][0]
+    *_, failed_on = first_batch
+    return len(failed_on)
 
 
 def _check(is_so: bool) -> None:

@@ -147,7 +147,9 @@ class AbstractBasis(eqx.Module):
         keys: Key[Array, " n"],
     ) -> Float[Array, "size C S m"]:
         """The coefficients of the functions fitted to `target`, at or near the pilot's
-        `states`. `keys` are the keys of its paths, by which a target can be estimated."""
+        `states`, of which the `good` ones did not fail. A basis calls `target(state)`, or
+        `target(state, key)` with the key of the pilot's path for a random estimate, which
+        costs less. (`C` candidates, `S` times and `m` numbers of `phi`.)"""
 
     @abc.abstractmethod
     def value_at(

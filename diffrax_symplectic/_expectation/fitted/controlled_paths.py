@@ -1,12 +1,14 @@
 """Paths with a control variate from value functions."""
 
-from typing import NamedTuple
+import functools as ft
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, PyTree
 
+from ..._custom_types import Args, Y
 from ..._simulation import (
     as_vectors,
     combinations,
@@ -21,7 +23,7 @@ from ..._simulation import (
 from ..sampling import Averaged, Samples
 from .fits import Choice, FittedFunctions
 from .mixture import log_ratios_of_outcomes, Mixture
-from .noise import Noise
+from .noise import Noise, StepOfPath
 
 
 class _Control(NamedTuple):
@@ -44,59 +46,92 @@ def controlled_paths(
     keys: Key[Array, " n"],
 ) -> Samples:
     """A sample is the value of a path minus its control variate, by `functions` with a
-    leading axis of levels, weighted by the likelihood ratio of a path that draws its noise
-    by a mixture of laws."""
+    leading axis of levels. It is weighted by the likelihood ratio of the path, since paths
+    draw their noise by the laws of the `mixture`, not all by their own."""
     functions = functions.of_candidates(choice.best)
     starts = jax.vmap(problem.draw_start)(keys)
     laws = jax.vmap(mixture.draw_law)(keys)
 
     def motion_on(level: Level) -> Motion:
-        noise = Noise.of(problem, level)
-        u = jtu.tree_map(lambda x: x[level.index], functions)
-        cuts = jnp.asarray(mixture.cuts)[level.index]
-        log_ratios = jnp.asarray(mixture.log_ratios)[level.index]
+        of_level = _Level(
+            noise=Noise.of(problem, level),
+            value_functions=jtu.tree_map(lambda x: x[level.index], functions),
+            cuts_of_laws=jnp.asarray(mixture.cuts)[level.index],
+            log_ratios=jnp.asarray(mixture.log_ratios)[level.index],
+        )
 
-        def step(i, paths):
-            second_derivatives = jtu.tree_map(lambda x: x[i], u.second_derivatives)
-
-            def step_of_path(y, solver_state, args, key, law):
-                x, has_outcome = noise.draw(key, i, cuts[law])
-                u_after_step = lambda y1: u(i, y1)
-                path_after = noise.with_args(args).advance(
-                    i, y, solver_state, u_after_step, second_derivatives, x
-                )
-                return path_after, log_ratios_of_outcomes(log_ratios, has_outcome)
-
+        def step(i: Any, paths: PathStates) -> PathStates:
             states = paths.y, paths.solver_state, paths.args
-            step_taken, log_ratios_of_step = jax.vmap(step_of_path)(*states, keys, laws)
+            advance = ft.partial(of_level.advance, i)
+            after_step, log_ratios = jax.vmap(advance)(*states, keys, laws)
             # A failed path has no value, but its control must be finite.
             control_of_step = jnp.where(
-                mask_like(step_taken.success, step_taken.control), step_taken.control, 0
+                mask_like(after_step.success, after_step.control), after_step.control, 0
             )
             so_far = paths.control
             control = _Control(
                 value=so_far.value + jnp.where(choice.used, control_of_step, 0),
-                log_ratios=so_far.log_ratios + log_ratios_of_step,
+                log_ratios=so_far.log_ratios + log_ratios,
             )
             return paths.after_step(
                 problem,
-                step_taken.y,
-                step_taken.solver_state,
-                step_taken.success,
+                after_step.y,
+                after_step.solver_state,
+                after_step.success,
                 control,
             )
 
-        def first_solver_state(y, args):
-            return noise.with_args(args).new_solver_state(0, y)
+        def first_solver_state(y: Y, args: Args) -> PyTree[Array]:
+            return of_level.noise.with_args(args).new_solver_state(0, y)
 
-        dtype = jax.eval_shape(lambda: u(0, problem.y0)).dtype
-        zero = jnp.zeros((len(keys), *problem.output_shape), dtype)
-        no_control = _Control(zero, jnp.zeros((len(keys), len(log_ratios)), dtype))
+        dtype = jax.eval_shape(lambda: of_level.value_functions(0, problem.y0)).dtype
+        num_laws = len(of_level.log_ratios)
+        no_control = _Control(
+            value=jnp.zeros((len(keys), *problem.output_shape), dtype),
+            log_ratios=jnp.zeros((len(keys), num_laws), dtype),
+        )
         solver_state = jax.vmap(first_solver_state)(*starts)
         return Motion(step, PathStates.start(problem, starts, solver_state, no_control))
 
     simulated = simulate(problem, motion_on)
     return _samples_of(problem, mixture, laws, simulated)
+
+
+class _Level(NamedTuple):
+    """What the paths on a level need.
+
+    - `noise`, `value_functions`: those of the level.
+    - `cuts_of_laws`, `log_ratios`: the fields of a `Mixture`, for this level.
+    """
+
+    noise: Noise
+    value_functions: FittedFunctions
+    cuts_of_laws: Array
+    log_ratios: Array
+
+    def advance(
+        self,
+        i: Any,
+        y: Y,
+        solver_state: PyTree[Array],
+        args: Args,
+        key: PRNGKeyArray,
+        law: Int[Array, ""],
+    ) -> tuple[StepOfPath, Float[Array, " laws"]]:
+        """A path after step `i`, with noise by this law; and the logarithms of the
+        likelihood ratios of this noise."""
+        functions = self.value_functions
+        second_derivatives = jtu.tree_map(lambda x: x[i], functions.second_derivatives)
+        variables, has_outcome = self.noise.draw(key, i, self.cuts_of_laws[law])
+        path_after_step = self.noise.with_args(args).advance(
+            i,
+            y,
+            solver_state,
+            ft.partial(functions, i),
+            second_derivatives,
+            variables,
+        )
+        return path_after_step, log_ratios_of_outcomes(self.log_ratios, has_outcome)
 
 
 def _samples_of(

@@ -194,10 +194,10 @@ class Grid(AbstractBasis):
         half = _STENCIL // 2
         # The coordinates of the point, in spacings of the grid from its first point.
         place = (x + 1) * (n - 1) / 2
-        # Whether the grid has so many points on each side.
+        # Whether that many points of the grid lie on each side.
         is_inside = jnp.all((place >= half - 1) & (place <= n - half))
         # Outside, the result at some place inside is computed, and dropped.
-        place = jnp.clip(jnp.where(is_inside, place, n / 2), half - 1, n - half)
+        place = jnp.where(is_inside, place, n / 2)
         # The first interpolation point along each axis.
         begin = jnp.minimum(jnp.floor(place) - (half - 1), n - _STENCIL)
         start_indices = jnp.pad(begin.astype(jnp.int32), (0, len(value_shape)))

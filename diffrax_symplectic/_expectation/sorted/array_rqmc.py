@@ -126,9 +126,9 @@ class ArrayRQMC(AbstractSampling):
                 f"`ArrayRQMC` takes 1 to {_MAX_DIMENSION:,}, the dimensions of Sobol' "
                 "points. Pass `sampling=IndependentPaths(num_paths)`."
             )
-        sort_by = _state_itself if self.sort_by is None else self.sort_by
-        check_takes("sort_by", sort_by, "y")
-        sort_by = traced(sort_by, problem.y0)
+        sort_function = _state_itself if self.sort_by is None else self.sort_by
+        check_takes("sort_by", sort_function, "y")
+        sort_by = traced(sort_function, problem.y0)
         coordinates = jax.eval_shape(sort_by, problem.y0)
         check_real("sort_by", jtu.tree_leaves(coordinates))
         num_coordinates = jax.eval_shape(lambda: real_vector(sort_by(problem.y0))).size
@@ -136,10 +136,10 @@ class ArrayRQMC(AbstractSampling):
         points = jnp.asarray(sobol_points(self.num_paths, layout.num_words))
         _warn_of_many_coordinates(self.num_paths, num_coordinates, stacklevel=5)
 
-        def plan_for(problem: Problem) -> SamplingPlan:
+        def plan_for(any_steps: Problem) -> SamplingPlan:
             return SamplingPlan(
-                jtu.Partial(_samples_of_replicate, problem, sort_by, points, layout),
-                Outputs.of(problem),
+                jtu.Partial(_samples_of_replicate, any_steps, sort_by, points, layout),
+                Outputs.of(any_steps),
                 num_samples=self.replicates,
                 # All paths of a replicate are solved at once, which is a batch already.
                 batch_size=1,
@@ -148,9 +148,10 @@ class ArrayRQMC(AbstractSampling):
                 least_samples=_LEAST_REPLICATES,
             )
 
-        problem = problem.with_any_steps()
-        with_half_steps = ft.partial(plan_for, problem.with_half_steps())
-        return plan_for(problem)._replace(with_half_steps=with_half_steps)
+        # With half the steps the program is the same.
+        any_steps = problem.with_any_steps()
+        with_half_steps = ft.partial(plan_for, any_steps.with_half_steps())
+        return plan_for(any_steps)._replace(with_half_steps=with_half_steps)
 
 
 def _samples_of_replicate(
@@ -220,10 +221,13 @@ def _words_of_paths(
     layout: "WordLayout",
     i: Any,
 ) -> UInt32[Array, "n d"]:
-    """The random words of each path in step `i`: the points, scrambled anew."""
+    """The random words of each path in step `i`: the points, scrambled anew on each level
+    and in each step."""
     key = jr.fold_in(jr.fold_in(replicate_key, level.index), i)
     _, d = points.shape
     seeds = jr.bits(key, (num_seeds(d),), jnp.uint32)
+    # Its outer values have probability one sixth, for which a power of two of points is not
+    # balanced.
     if layout.is_one_three_point_variable:
         return balanced_in_sixths(points, seeds)
     return scrambled(points, seeds)

@@ -374,9 +374,10 @@ def _checked_matrix(
     path_struct: PyTree[jax.ShapeDtypeStruct] | None,
 ) -> _Matrix:
     """The matrix with its root. Raises a `ValueError` if it is known to be invalid."""
-    # Without a path the shapes of the momenta are known in the solve only.
+    # Without a path the shapes of the momenta are known in the solve only. Here any fit.
     momenta = operator.in_structure() if path_struct is None else path_struct
     _check_matrix(operator, momenta, "the `path` and the momenta")
+    # The root of any other matrix than a semidefinite one is NaN.
     root = _root_of(operator)
     is_semidefinite = ~jnp.any(jnp.isnan(root))
     if not is_traced(is_semidefinite) and not is_semidefinite:

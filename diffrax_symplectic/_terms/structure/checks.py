@@ -146,9 +146,9 @@ def separable_fault(
         return fault
     drift_traces = trace((*frictionless, *friction))
     noise_traces = trace(noise)
-    leaves_unchanged = ft.partial(_leaves_unchanged, t0, y0, args)
+    keeps_half = ft.partial(_keeps_half, t0, y0, args)
     faults, faults_if_exchanged = [
-        _separable_faults(momentum_half, drift_traces, noise_traces, leaves_unchanged)
+        _separable_faults(momentum_half, drift_traces, noise_traces, keeps_half)
         for momentum_half in (0, 1)
     ]
     if len(faults) == 0:
@@ -193,13 +193,13 @@ def _separable_faults(
     momentum_half: int,
     drift: list[_Traced],
     noise: list[_Traced],
-    leaves_unchanged: Callable[[diffrax.AbstractTerm, int], bool],
+    keeps_half: Callable[[diffrax.AbstractTerm, int], bool],
 ) -> list[Fault]:
     """All reasons why a system is not separable, if momenta are the half of the state with
-    this number, 0 or 1. `leaves_unchanged` says whether a noise term leaves the half with a
+    this number, 0 or 1. `keeps_half` says whether a noise term leaves the half with a
     number unchanged."""
     of_drift = _faults_of_drift(momentum_half, drift)
-    return of_drift + _faults_of_noise(momentum_half, noise, leaves_unchanged)
+    return of_drift + _faults_of_noise(momentum_half, noise, keeps_half)
 
 
 def _faults_of_drift(momentum_half: int, drift: list[_Traced]) -> list[Fault]:
@@ -247,7 +247,7 @@ def _faults_of_drift(momentum_half: int, drift: list[_Traced]) -> list[Fault]:
 def _faults_of_noise(
     momentum_half: int,
     noise: list[_Traced],
-    leaves_unchanged: Callable[[diffrax.AbstractTerm, int], bool],
+    keeps_half: Callable[[diffrax.AbstractTerm, int], bool],
 ) -> list[Fault]:
     """`_separable_faults` of the noise."""
     position_half = 1 - momentum_half
@@ -261,7 +261,7 @@ def _faults_of_noise(
         # The change of q is linear in the increment, so it is zero if it does not depend
         # on the increment.
         may_move_q = not dependence.independent(_increments, change_of_positions)
-        if may_move_q and not leaves_unchanged(term, position_half):
+        if may_move_q and not keeps_half(term, position_half):
             of_plain = "a noise term changes q, the second half of the state"
             cause = of_plain if is_plain else "dH_k/dp is not zero"
             faults.append(Fault(cause, advice))
@@ -354,14 +354,16 @@ def _dependence(
     return Dependence(change_of_state, t0, y0, control_struct(term, t0))
 
 
-def _leaves_unchanged(
+def _keeps_half(
     t0: RealScalarLike, y0: Y, args: Args, term: diffrax.AbstractTerm, half: int
 ) -> bool:
     """Whether a plain noise term leaves one half of the state unchanged because its matrix
     has a block of zeros that is known while tracing."""
+    # What a term of a Hamiltonian reads is known by its derivatives.
     if is_hamiltonian(term):
         return False
     struct = control_struct(term, t0)
+    # Under `jit` the entries of a known matrix would be traced.
     with at_trace_time():
         zeros, unravel = zeros_and_unravel(struct)
         # One noise at a time.
