@@ -34,7 +34,7 @@ class LinearFlowState(NamedTuple):
     is_broken: Bool[Array, ""]
 
 
-# The end of each message that refuses a heat bath.
+# The end of each refusal: what to use in a heat bath.
 _FOR_A_BATH = (
     "In a heat bath use `BAOAB(linear_flow(...))`, or `BAOAB(flow)` with a function of "
     "your own, for `langevin_terms(H0, friction, temperature, path, slow=rest)` of the "
