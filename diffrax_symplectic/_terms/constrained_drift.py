@@ -43,7 +43,7 @@ class ConstrainedDrift(diffrax.AbstractTerm, AbstractCaller):
 
     def vf(self, t, y, args) -> PyTree[Array]:
         # Diffrax looks at the structure of the vector field before any solve, so the error
-        # cannot be raised here. The values must not be used.
+        # cannot be raised here. The values must not be used, hence NaN.
         return jtu.tree_map(_nan_like, y)
 
     def contr(self, t0, t1, **kwargs) -> Any:
