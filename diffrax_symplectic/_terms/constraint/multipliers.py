@@ -133,9 +133,11 @@ def weighted_sum(x: Multipliers, vectors: Float[Array, "c n"]) -> Vector:
 # Sums over axes up to this length are unrolled, so that XLA fuses them. On CPUs it calls a
 # library for each other sum or product of matrices: steps of rigid dimers took three times
 # as long.
-_SHORT = 32
+_MOST_UNROLLED = 32
 
 
 def _total(x: Float[Array, "n ..."]) -> Float[Array, "..."]:
     """The sum over the first axis."""
-    return ft.reduce(operator.add, x) if len(x) <= _SHORT else jnp.sum(x, axis=0)
+    return (
+        ft.reduce(operator.add, x) if len(x) <= _MOST_UNROLLED else jnp.sum(x, axis=0)
+    )

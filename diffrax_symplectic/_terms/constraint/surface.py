@@ -107,7 +107,10 @@ class Surface(NamedTuple):
         response: Callable[[Vector], Vector] | None = None,
     ) -> Vector:
         """The tangent momentum: `p` after those impulses of the constraint forces that make
-        it tangent. An impulse changes the momentum by itself, or by its `response`."""
+        it tangent. An impulse `x` changes the momentum by `x`; or by `response(x)`, for
+        example if friction acts on it, too."""
+        # The change of the momentum by a unit impulse along each normal, (c, n), and the
+        # change of J v by it.
         if response is None:
             gram = normal_space.gram
             changes = normal_space.normals

@@ -63,9 +63,10 @@ class Fault(NamedTuple):
     - `cause`: what is wrong, as a part of a sentence.
     - `advice`: what to do, in sentences.
     - `friction`: whether all that is wrong is a force of plain terms that depends on the
-        momentum, such as friction; with `wrong_way_round`, after the exchange.
-    - `wrong_way_round`: whether nothing else would be wrong with the halves of the state
-        exchanged.
+        momentum, such as friction; with `wrong_way_round`, all that is wrong once the
+        halves of the state are exchanged.
+    - `wrong_way_round`: whether with the halves of the state exchanged nothing would be
+        wrong, or friction alone.
     """
 
     cause: str
