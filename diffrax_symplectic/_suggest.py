@@ -74,8 +74,9 @@ from ._terms import (
 
 
 # The suggested solvers, best first: by order; then those that give stiff modes the right
-# energy; then by the size of the equations of a step. Those for friction are the first for
-# means in a heat bath, of which most are functions of positions, and exact.
+# energy; then by the size of the equations of a step. In a heat bath those for friction are
+# the first for means: most of these are of functions of positions, whose stationary law
+# is exact for harmonic modes.
 FOR_FRICTION = (BAOAB, LangevinMiddle)
 FOR_MEANS = (
     AdditiveGauss,
@@ -227,16 +228,17 @@ def suggest_solver(
     solvers = _suitable(system, want, paths, one_term=len(noise) == 1)
 
     numbers = motion_numbers(random_paths(terms))
-
-    needed = which_need_truncation(terms, t0, y0, args)
+    # For each path, whether implicit steps need its increments bounded.
+    needs_truncation = which_need_truncation(terms, t0, y0, args)
 
     def terms_for(solver: AbstractSymplecticSolver) -> jtu.Partial:
         """The function of a key that returns the terms with paths of this solver."""
         is_implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-        which = tuple(is_implicit and need for need in needed)
+        which_truncated = tuple(is_implicit and needed for needed in needs_truncation)
         make_path = ft.partial(own_path, solver, want)
         return jtu.Partial(
-            ft.partial(_terms_with_paths, make_path, numbers, which), given_terms
+            ft.partial(_terms_with_paths, make_path, numbers, which_truncated),
+            given_terms,
         )
 
     suggestions = tuple(
@@ -245,7 +247,7 @@ def suggest_solver(
             want,
             terms,
             commute=system.commute,
-            needs_bounded=any(needed),
+            needs_bounded=any(needs_truncation),
             terms_of_key=terms_for(solver),
         )
         for solver in solvers
@@ -266,7 +268,9 @@ def _terms_with_paths(
     terms: diffrax.AbstractTerm,
     key: PRNGKeyArray,
 ) -> diffrax.AbstractTerm:
-    """The terms with paths made by `make_path` for this key."""
+    """The terms with paths made by `make_path` for this key, and truncation in those whose
+    flag in `which_truncated` is true. `numbers` are the `motion_numbers` of the random
+    paths."""
     return with_truncation(with_paths(make_path, numbers, terms, key), which_truncated)
 
 
@@ -395,8 +399,8 @@ def _suitable(
     if not one_term or not jtu.all_leaves([increment_struct(paths[0])]):
         # Lévy areas are only sampled between the noises of one array.
         solvers = [solver for solver in solvers if not _needs_areas(solver)]
-    # No path of a solver can take the place of given noise, or of a path whose law is not
-    # known.
+    # Given noise, and paths whose law is not known, are not replaced by paths of a solver,
+    # so only solvers that find their random variables in these are suitable.
     kept = [path for path in paths if not is_random(path) or has_unknown_law(path)]
     return [
         solver
@@ -442,8 +446,8 @@ def accepts_friction(
     args: Args,
     solver: BAOAB,
 ) -> bool:
-    """Whether these are Langevin terms that this `BAOAB` accepts: terms that it refuses for
-    any reason count as others."""
+    """Whether these are Langevin terms that this `BAOAB` accepts: that it raises no
+    `ValueError` for, of any kind."""
     try:
         solver.check(terms, t0, y0, args)
     except ValueError:
@@ -476,10 +480,12 @@ def ranked(
     kinds = list(filter(is_suitable, FOR_MEANS if want == "weak" else FOR_PATHS))
     if want == "weak":
         if NinomiyaVictoir in kinds and num_noises > _MOST_FLOWS_OF_NOISE:
+            # It takes one flow for each noise, so it comes last.
             kinds.remove(NinomiyaVictoir)
             kinds.append(NinomiyaVictoir)
         if friction or friction_in_drift:
-            # It has exact stationary means of harmonic modes at every step.
+            # It comes before these: at every step size it has the exact stationary means of
+            # harmonic modes.
             kinds.remove(SRKw1)
             kinds.insert(0, SRKw1)
         if friction:
@@ -529,16 +535,18 @@ def _path_code(
     terms: diffrax.AbstractTerm,
     needs_bounded: bool,
 ) -> str:
-    """The code, or the words, for the paths of a suggestion. Of several paths the first one
-    stands for all, which differ in their shapes at most."""
+    """The path of a suggestion: the code that makes it, or in words which path of the terms
+    is kept. Of several paths that are made, which can differ only in their shapes, it is
+    the first."""
     random_noise = random_paths(terms)
     replaceable = [path for path in random_noise if not has_unknown_law(path)]
     if replaceable:
         struct = increment_struct(replaceable[0])
         shape = _shape_code(struct)
-        # The solver decides, so an example of its paths is made.
-        path = solver.path(struct, jr.key(0), want=want)
-        if isinstance(path, TruncatedBrownianPath) and not needs_bounded:
+        # `solver.path` truncates without knowing the terms. Where they need no bounds, the
+        # code makes the same path without truncation. An example tells which path it makes.
+        example = solver.path(struct, jr.key(0), want=want)
+        if isinstance(example, TruncatedBrownianPath) and not needs_bounded:
             return f"ds.FixedStepBrownianPath({shape}, key)"
         return f'{_code(solver, "ds.")}.path({shape}, key, want="{want}")'
     if random_noise:

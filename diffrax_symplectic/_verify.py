@@ -175,20 +175,22 @@ def poisson_defect(
 
     jacobian, (s1, result) = jax.jacrev(step, has_aux=True)(s0)
     jacobian = result.error_if(jacobian, result != diffrax.RESULTS.successful)
-    # Row i of `gradients` is ds1_i / ds0, and row i of `unit_vectors` the gradient of s_i
-    # itself.
+    # (n, *s0.shape) for n components: row i of `gradients` is ds1_i / ds0, and row i of
+    # `unit_vectors` the gradient of s_i itself.
     num_components = s0.size
     gradients = jacobian.reshape(num_components, *s0.shape)
     identity = jnp.eye(num_components, dtype=s0.dtype)
     unit_vectors = identity.reshape(num_components, *s0.shape)
 
-    def matrix(rows: Array) -> Array:
+    def as_matrix(rows: Array) -> Array:
         return rows.reshape(num_components, num_components)
 
-    # P(s) is never formed: the cross products of s with the rows of a matrix are the
-    # columns of P(s) times the transposed matrix. J P(s0) J^T, and then P(s1):
-    J_P_Jt = _dot(matrix(gradients), matrix(jnp.cross(s0, gradients)).T)
-    P_s1 = matrix(jnp.cross(s1, unit_vectors)).T
+    # P(s) is never formed: since P(s) v = s x v, the cross products of s with the rows of a
+    # matrix M are the columns of P(s) M^T. This is used with M = J and M = 1.
+    J = as_matrix(gradients)
+    P_Jt = as_matrix(jnp.cross(s0, gradients)).T
+    J_P_Jt = _dot(J, P_Jt)
+    P_s1 = as_matrix(jnp.cross(s1, unit_vectors)).T
     return jnp.max(jnp.abs(J_P_Jt - P_s1))
 
 

@@ -89,8 +89,9 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     def tableau(self) -> AdditiveTableau:
         beta1 = self.beta1
         beta2 = self.beta2
-        # I_k0 / h has the variance h / 3, while that of the path is h / 2 in the mean over
-        # the step. So the squares of the factors are 3 / 2 in the mean over both stages.
+        # The stages contain I_k0 / h times these factors in place of the path. I_k0 / h has
+        # the variance h / 3, and the path, in the mean over the step, h / 2. So the mean of
+        # the squared factors over both stages is 3 / 2.
         first_factor = 1 + self.sign / np.sqrt(2)
         second_factor = 1 - self.sign / np.sqrt(2)
         # The coefficients of I_k and I_k0 / h in the formulas above.

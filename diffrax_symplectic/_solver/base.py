@@ -288,11 +288,11 @@ def _without_idle_stages(
         terms = drift if stage.channels == ("h",) else noise
         if len(terms) > 0:
             driven_stages.append(i)
-    tableau = tableau.take(driven_stages)
+    driven = tableau.take(driven_stages)
     if len(drift) > 0:
-        return tableau
-    stages = tuple(_without_drift_brackets(stage) for stage in tableau.stages)
-    return dataclasses.replace(tableau, stages=stages)
+        return driven
+    stages = tuple(_without_drift_brackets(stage) for stage in driven.stages)
+    return dataclasses.replace(driven, stages=stages)
 
 
 def _without_drift_brackets(stage: Stage) -> Stage:

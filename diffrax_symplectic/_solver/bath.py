@@ -25,11 +25,11 @@ from .._terms import (
 )
 
 
-# Up to this many momenta, friction by a matrix is one linear solve in each step, which the
-# fused engine replays, too. Above, where that engine takes no matrices, constant matrices
-# are diagonalized once. With 64 momenta that takes 4 ms, and a step of `BAOAB` 3.6 us in
-# place of 22, or 1.5 us in place of 18 in a batch of 64 paths.
-_MAX_SOLVED = 16
+# For up to this many momenta, friction by a matrix is one linear solve in each step, which
+# the fused engine replays, too. For more, where that engine takes no matrices, a constant
+# matrix is diagonalized once for all steps. With 64 momenta that takes 4 ms, and a step of
+# `BAOAB` then 3.6 us in place of 22, or 1.5 us in place of 18 in a batch of 64 paths.
+_MAX_SOLVED_IN_EACH_STEP = 16
 
 
 def check_friction(
@@ -76,6 +76,7 @@ def check_friction(
 
     # A function is linear, up to a constant, if its derivative is the same everywhere. The
     # friction is G(t, q) times the velocities dH0/dp, so only these can be nonlinear in p.
+    # The second `p` stands for the change, which has its shapes; values are not read.
     dependence = Dependence(slope, p, p)
     if not dependence.independent(lambda p, change: p):
         raise ValueError(
@@ -133,7 +134,7 @@ def after_friction(
     rhs = step_size * flat_force(flat_p) + flat_impulse
     matrix = jnp.eye(flat_p.size, dtype=flat_p.dtype) - step_size / 2 * slope
     matrices = None
-    if flat_p.size > _MAX_SOLVED:
+    if flat_p.size > _MAX_SOLVED_IN_EACH_STEP:
         matrices = _matrices_if_constant(friction, t, y, args)
     if matrices is not None:
         return unravel(flat_p + _solve_by_modes(matrices, step_size, matrix, rhs))
@@ -150,7 +151,8 @@ def _after_own_friction(
 ) -> PyTree[Array]:
     """`after_friction` where the `force` on each momentum depends on this momentum alone:
     one equation each."""
-    # The slopes are the derivative along ones.
+    # Each force has one slope, by its own momentum, so the derivative along ones is all of
+    # them.
     ones = jtu.tree_map(jnp.ones_like, p)
     forces, slopes = jax.jvp(force, (p,), (ones,))
 
@@ -215,11 +217,11 @@ def _solve_by_modes(
     """The solution of `matrix @ x = rhs` for `matrix = 1 + step_size / 2 * G M^-1`, by the
     modes of the constant matrices G and M^-1.
 
-    The modes do not depend on the step. (Sizes of steps differ by rounding errors, so that
-    `matrix` itself is not the same in all; it carries the derivatives.) The modes are
-    computed here, in the step, since a batch would copy them into the state of each path.
-    On CPUs XLA moves this computation out of the loop. On other devices XLA would leave it
-    there, where it takes forty times as long as a solve, so these solve with `matrix`.
+    The modes are the same in all steps, while `matrix` changes with the rounding errors of
+    `step_size`; derivatives are taken of the equation with `matrix`. The modes are computed
+    here, in the step: in the state of the solver a batch would copy them for each path. On
+    CPUs XLA moves their computation out of the loop over steps. On other devices it would
+    stay in the loop and take forty times as long as a solve, so these solve with `matrix`.
     """
 
     def multiply(x: Array) -> Array:
@@ -239,7 +241,7 @@ def _solve_by_modes(
         by_matrix = ft.partial(jnp.linalg.solve, matrix.T)
         return lax.platform_dependent(rhs, cpu=by_modes_transposed, default=by_matrix)
 
-    # Derivatives are those of the equation. Those of eigenvectors may be infinite.
+    # Derivatives are taken of the equation. Those of eigenvectors may be infinite.
     return lax.custom_linear_solve(multiply, rhs, solve, solve_transposed)
 
 

@@ -66,12 +66,13 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         noises="commuting",
         right_energy_unresolved=True,
         most_friction=0.5,
-        # With two levels, the share of means that were off by more than two error bars, for
-        # all phases of a Kubo oscillator with noise 0.27 (p^2 + q^2) / 2 in units of omega:
-        # 1, 3, 11, 19 and 36% for omega h = 0.5, 1, 1.5, 2 and 3 up to the time 30 / omega;
-        # 4, 14, 31, 54 and 73% up to 100 / omega. Three levels of a quantum system, coupled
-        # by pulses: 3 of 36 populations for omega h up to 1.1, where one, between changes
-        # of opposite signs, was off by 3.8; 21 of 36 for 2 and more, by up to 27.
+        # Measured with two levels, as the share of means that were off by more than two
+        # error bars. For a Kubo oscillator with noise 0.27 (p^2 + q^2) / 2 in units of
+        # omega, at all phases: 1, 3, 11, 19 and 36% for omega h = 0.5, 1, 1.5, 2 and 3 up
+        # to the time 30 / omega; 4, 14, 31, 54 and 73% up to 100 / omega. For a quantum
+        # system of three levels, coupled by pulses: 3 of 36 populations for omega h up to
+        # 1.1, where one, between changes of opposite signs, was off by 3.8 error bars; 21
+        # of 36 for 2 and more, by up to 27.
         most_frequency=1.0,
     )
     tableau: ClassVar[GeneralTableau] = GeneralTableau(
@@ -190,7 +191,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
             change = jtu.Partial(
                 apply_one, noise, flow.noise_index, flow.increment, args
             )
-            # Time stands still, so all stages are at the middle of the step.
+            # A step of size zero: time stands still, and `change` has the increment in it.
             step = Step(flow.t0, jnp.zeros_like(flow.t0), {"h": change})
             return take_step(_FLOW, step, y, self, outcome)
 

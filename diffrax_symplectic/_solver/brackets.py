@@ -55,17 +55,19 @@ def bridge_coefficients(
     r"""$H_k$ and $L_{kl} / h$ of [`diffrax_symplectic.PlateauGauss`][] for `m` noises,
     given the space-time areas, and space-time-time areas unless `K` is `None`.
 
-    A Brownian bridge is $6 u (1 - u) H + 120 u (1 - u) (\frac12 - u) K$ with $u = s / h$
-    plus an independent remainder. The time average of its mean square is $h / 15$ without
-    the second summand, and $3 h / 70$ with it.
+    A Brownian path is the line $u W$ with $u = s / h$ plus a bridge, which is
+    $6 u (1 - u) H + 120 u (1 - u) (\frac12 - u) K$ plus an independent remainder. The mean
+    square of the remainder, averaged over the step, is $h / 15$ without the summand of $K$,
+    and $3 h / 70$ with it.
     """
     W_k, _ = jfu.ravel_pytree(W)
     H_k, _ = jfu.ravel_pytree(H)
     # In a solve backward in time steps are negative, and the mean square is not.
     step_size = jnp.abs(h).astype(H_k.dtype)
     h_delta_kl = jnp.eye(H_k.size, dtype=H_k.dtype) * step_size
-    # The squares of the bridge and of its remainder enter with half of their time averages:
-    # 36 u^2 (1 - u)^2 has the average 6 / 5, the square of the factor of K 120 / 7.
+    # Squares of parts of the bridge enter with half of their averages over the step. The
+    # square of the factor 6 u (1 - u) of H has the average 6 / 5, that of the factor of K
+    # 120 / 7. The product of the line u and the factor of K has the average -1.
     L_kl = 3 / 5 * jnp.outer(H_k, H_k)
     if K is None:
         return H_k, L_kl + h_delta_kl / 30
@@ -91,14 +93,14 @@ def apply_bridge(
     """
     _, unravel = zeros_and_unravel([control_struct(term) for term in noise])
     t = jnp.asarray(t, jnp.result_type(h))
-    areas, _ = bridge_coefficients
+    H, _ = bridge_coefficients
 
     def b(increments: Float[Array, " m"], t: Array, y: Y) -> Y:
         """The noise with these increments."""
         pairs = zip(noise, unravel(increments))
         return tree_sum([term.vf_prod(t, y, args, control) for term, control in pairs])
 
-    def bracket(
+    def bracket_and_field(
         increments: Float[Array, " m"], field: Callable, t: Array, y: Y, speed: Array
     ) -> tuple[Y, Y]:
         """`[b, field]`, where `field` advances time by `speed`; and `field` itself."""
@@ -110,18 +112,19 @@ def apply_bridge(
 
     def drift_bracket(unit: Float[Array, " m"], t: Array, y: Y) -> Y:
         """`[b_k, A]` for the noise `k` of this unit vector."""
-        value, _ = bracket(unit, drift, t, y, jnp.asarray(h, t.dtype))
-        return value
+        bracket, _ = bracket_and_field(unit, drift, t, y, jnp.asarray(h, t.dtype))
+        return bracket
 
     def summand(unit: Float[Array, " m"], H_k: Array, L_k: Float[Array, " m"]) -> Y:
         """`[sum_l L_kl b_l, [b_k, A]] + H_k [b_k, A]`: by linearity one outer bracket
         serves for all `l`."""
         inner = ft.partial(drift_bracket, unit)
-        # The inner bracket contains no drift outside of a bracket, so it leaves the time.
-        double, single = bracket(L_k, inner, t, y, jnp.zeros_like(t))
+        # The drift advances time at a constant speed, and the noise does not advance it. So
+        # their bracket has no component along time.
+        double, single = bracket_and_field(L_k, inner, t, y, jnp.zeros_like(t))
         return (double**ω + H_k * single**ω).ω
 
-    units: Any = np.eye(areas.size, dtype=areas.dtype)
+    units: Any = np.eye(H.size, dtype=H.dtype)
     return _total(jax.vmap(summand)(units, *bridge_coefficients), len(units))
 
 

@@ -104,7 +104,7 @@ def drawn_variables(
 
     Raises a `ValueError`, which quotes `solver_name`, if a path lacks one of `names`.
     """
-    t1 = _within_resolution(noise, t0, t1)
+    t1 = _with_resolution_checked(noise, t0, t1)
     # Without Lévy areas an increment is `W` itself.
     only_increments = names == ["W"]
     options = {} if only_increments else {"use_levy": True}
@@ -121,7 +121,8 @@ def drawn_variables(
     def all_have(name: str) -> bool:
         return all(getattr(x, name, None) is not None for x in increments)
 
-    # The variable whose paths hold most comes first: its advice fits the others, too.
+    # If several are missing, the message is about the one of highest rank: a path that has
+    # it also has those of lower rank.
     for name in sorted(names, key=_rank, reverse=True):
         if not all_have(name):
             raise ValueError(f"`{solver_name}` needs {_how_to_get(name, noise)}.")
@@ -171,7 +172,7 @@ def _with_sign_restored(
     return (direction(term) * value**ω).ω if is_even else value
 
 
-def _within_resolution(
+def _with_resolution_checked(
     noise: Terms, t0: RealScalarLike, t1: RealScalarLike
 ) -> RealScalarLike:
     """`t1`, with an error when run if a `VirtualBrownianTree` does not resolve the step."""

@@ -34,8 +34,8 @@ class LinearFlowState(NamedTuple):
     is_broken: Bool[Array, ""]
 
 
-# What to use in a heat bath, for every refusal.
-_BATH = (
+# The end of each refusal: what to use in a heat bath.
+_FOR_A_BATH = (
     "In a heat bath use `BAOAB(linear_flow(...))`, or `BAOAB(flow)` with a function of "
     "your own, for `langevin_terms(H0, friction, temperature, path, slow=rest)` of the "
     "whole energy: friction acts between two halves of the flow."
@@ -98,7 +98,7 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
                 f"got `{inner.__name__}`."
             )
         if issubclass(inner, AbstractLangevinSplitting):
-            raise ValueError(f"`LinearFlow` takes no `{inner.__name__}`. {_BATH}")
+            raise ValueError(f"`LinearFlow` takes no `{inner.__name__}`. {_FOR_A_BATH}")
         check_takes("flow", self.flow, "time", "y", "args")
 
     @property
@@ -156,13 +156,15 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
         terms, _ = momentum_first(terms, y0)
         drift, friction, _ = split_friction(terms)
         if len(friction) > 0:
-            raise ValueError(f"`LinearFlow` takes no terms with friction. {_BATH}")
+            raise ValueError(
+                f"`LinearFlow` takes no terms with friction. {_FOR_A_BATH}"
+            )
         _, slow = slow_apart(drift)
         if len(slow) > 0:
             raise ValueError(
                 "The terms of `LinearFlow` contain the rest alone, without the energy that "
                 "`flow` stands for: pass `hamiltonian_terms(rest)`, without `slow=`. "
-                f"{_BATH}"
+                f"{_FOR_A_BATH}"
             )
         check_returns_pair(self.flow, t0, y0, args)
         t0 = jnp.asarray(t0, jnp.result_type(t0, jnp.float32))
@@ -170,7 +172,7 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
         def after_flow(time: RealScalarLike, y: Y) -> Y:
             return self.flow(time, y, args)
 
-        # `t0` stands for any duration: dependence is decided without values.
+        # `t0` stands for the duration: `Dependence` traces the flow, and reads no values.
         dependence = Dependence(after_flow, t0, y0)
         if dependence.independent(lambda time, y: time):
             raise ValueError(
@@ -188,29 +190,30 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
         return LinearFlowState(inner_state, is_broken)
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
+        del made_jump
         inner_state, is_broken = solver_state
         # Steps are positive even in a solve backward in time, where the flow runs back.
         half = direction(terms) * (t1 - t0) / 2
-        y = self.flow(half, y0, args)
+        y_before_step = self.flow(half, y0, args)
         # The flow is a jump for a solver that remembers the end of its last step.
-        made_jump = True
-        y, error, _, inner_state, result = self.solver.step(
-            terms, t0, t1, y, args, inner_state, made_jump
+        flow_is_jump = True
+        y_after_step, error, _, inner_state, result = self.solver.step(
+            terms, t0, t1, y_before_step, args, inner_state, flow_is_jump
         )
-        y1 = self.flow(half, y, args)
+        y1 = self.flow(half, y_after_step, args)
         R: Any = diffrax.RESULTS
         result = R.where(is_broken, R.nonfinite, result)
         state = LinearFlowState(inner_state, is_broken)
         return y1, error, dict(y0=y0, y1=y1), state, result
 
 
-def _at_most(order: Order | None, most: int) -> Order | None:
-    """The `order` of a solver, or a pair of orders for two kinds of noises, bounded by the
-    order `most` of the splitting around it."""
+def _at_most(order: Order | None, splitting_order: int) -> Order | None:
+    """The `order` of a solver, or a pair of orders for two kinds of noises, each lowered to
+    the order of the splitting around it if that is lower."""
     if isinstance(order, tuple):
         commuting, others = order
-        return min(commuting, most), min(others, most)
-    return None if order is None else min(order, most)
+        return min(commuting, splitting_order), min(others, splitting_order)
+    return None if order is None else min(order, splitting_order)
 
 
 LinearFlow.__init__.__doc__ = """**Arguments:**

@@ -110,13 +110,13 @@ def _structure_of(y: PyTree) -> PyTree:
 def returns_nan(
     flow: FlowFunction, time: RealScalarLike, y0: Y, args: Args
 ) -> Bool[Array, ""]:
-    """Whether a flow returns NaN at the start of a solve, after `time`, half of the first
-    step. Then it is also an error when run, but not in a batch, where the path fails
-    alone."""
+    """Whether a flow returns NaN after `time`, half of the first step, from the start `y0`
+    of a solve. This is also an error, but not in a batch: there the path has to fail by
+    this flag, without the others."""
     # The check has no derivative.
     y1 = jtu.tree_map(lax.stop_gradient, flow(time, y0, args))
     leaf_has_nan = jnp.stack([jnp.any(jnp.isnan(x)) for x in jtu.tree_leaves(y1)])
-    # If the path has failed already, NaN is not the fault of the flow.
+    # If `y0` is not finite, the path has failed before, and NaN is not the flow's fault.
     return refused_where(all_finite(y0) & jnp.any(leaf_has_nan), _NAN)
 
 
@@ -136,9 +136,9 @@ def begin_flow(
     y0: Y,
     args: Args,
 ) -> PyTree[Array]:
-    """The state of a flow at the start of a solve whose first step is from `t0` to `t1`,
-    with the flow over a share of it of length `time`: the state of a solver, or of a
-    function whether it returns NaN."""
+    """The state of a flow at the start of a solve. For a solver it is its own state, for a
+    first step from `t0` to `t1`. For a function it is whether this returns NaN after
+    `time`, the share of the first step for which it is called."""
     if not is_solver(flow):
         # Steps are positive even in a solve backward in time, where the flow runs back.
         return returns_nan(flow, direction(drift) * time, y0, args)  # pyright: ignore

@@ -101,8 +101,8 @@ def linear_flow(
     modes = (frequencies, to_modes, from_modes)
     all_modes_given = all(x is not None for x in modes)
     any_modes_given = any(x is not None for x in modes)
-    is_either = all_modes_given if stiffness is None else not any_modes_given
-    if not is_either:
+    is_one_way = all_modes_given if stiffness is None else not any_modes_given
+    if not is_one_way:
         raise ValueError(
             "Pass either `stiffness`, or `frequencies`, `to_modes` and `from_modes`."
         )
@@ -124,8 +124,8 @@ def linear_flow(
 def _modes_of(
     stiffness: ArrayLike, mass_roots: Float[Array, "..."]
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """The frequencies, and as columns the modes of the positions times the roots of their
-    masses: the eigenvectors of `M^-1/2 K M^-1/2`.
+    """The frequencies of the modes, the roots of the eigenvalues of `M^-1/2 K M^-1/2`; and
+    its eigenvectors as columns, the modes of the scaled positions `M^1/2 q`.
 
     They are computed by NumPy if all values are known, so that wrong ones raise a
     `ValueError`.
@@ -209,8 +209,9 @@ class CayleyFlow(eqx.Module):
         rest = self.rest.astype(dtype)
         omega = self.frequencies.astype(dtype)
         time = jnp.asarray(time, dtype)
-        # The sine of the angle is its cosine times `omega time`. The quotient of sine and
-        # frequency is right for a frequency of zero, too.
+        # The angle has the tangent `omega time`, which gives its cosine; the sine is the
+        # product of both. It is kept over the frequency: `time * cosine` has no division,
+        # and so is right for a frequency of zero, too.
         cosine = 1 / jnp.sqrt(1 + (omega * time) ** 2)
         sine_over_omega = time * cosine
         P = self.to_modes(p / mass_roots)

@@ -63,6 +63,7 @@ def _with_areas_for(
     if increment is PlateauIncrement:
         return PlateauBrownianPath(path, key)
     if increment is LevyAreaIncrement:
+        # A step samples all of its cells, so these have no Fourier terms, which cost time.
         num_terms = 2 if cell is None else 0
         return LevyAreaBrownianPath(path, key, num_terms=num_terms, cell=cell)
     return path

@@ -35,8 +35,9 @@ class Setting(NamedTuple):
     - `friction`, `noise`: the terms of the baths.
     - `increments`: of each bath in turn, those of all noises.
     - `args`: as for `diffrax.diffeqsolve`.
-    - `lengths`, `times`: by their shares, the lengths of parts of the step and the times
-        after them. Each is computed once, and is the same for all pieces.
+    - `lengths`, `times`: for shares `s` of the step, such as 0.5, the length `s h` of this
+        share and the time `t0 + s h` after it. Pieces with equal shares get the same array,
+        which is computed once.
     - `surface`: the surface of the constraint, if there is one.
     - `pending`: whether multipliers have to be found: not for a path that failed before.
     """
@@ -74,7 +75,8 @@ class Moving(NamedTuple):
     found: Any = True
 
     def after_move(self, y: Y, share: float, **changes: Any) -> "Moving":
-        """The state after the positions have moved for this share of the step."""
+        """The state after the positions have moved for this share of the step. Forces and
+        normals, known at the old positions, are dropped."""
         return self._replace(
             y=y,
             forces=None,
@@ -166,9 +168,10 @@ class Flight(AbstractPiece):
         if setting.surface is not None:
             return self._on_surface(setting, moving, setting.surface), None, None
         p, q = moving.y
-        # Velocities do not depend on time. Taken at a time at which the forces are
-        # evaluated, they share with these what depends on time alone. Of the rates only the
-        # velocities are used; XLA drops the forces.
+        # Velocities do not depend on time, so any time will do. The start of the step for
+        # the first flight, and its end for the last one, are times at which the kicks of
+        # `BAOAB` evaluate forces: XLA then computes once what depends on time alone. Of the
+        # rates only the velocities are used; XLA drops the forces.
         time = setting.times[0.0]
         if moving.elapsed > 0:
             time = setting.times[_rounded(moving.elapsed + self.share)]
@@ -266,31 +269,32 @@ class Bath(AbstractPiece):
     def move(self, setting, moving, flow_state):
         if setting.surface is not None:
             moving = moving.made_tangent(setting.surface)
-        y = p, q = moving.y
+        y = moving.y
+        p, q = y
         time = setting.times[moving.elapsed]
-        impulse = None
+        noise_impulse = None
         if len(setting.noise) > 0:
             increments = setting.increments[moving.num_baths]
-            impulse, _ = apply(setting.noise, increments, setting.args, time, y)
+            noise_impulse, _ = apply(setting.noise, increments, setting.args, time, y)
 
         def after_bath(impulse: PyTree[Array] | None) -> PyTree[Array]:
-            """The momenta after friction, with this impulse in the course of it."""
+            """The momenta after friction, and an impulse spread over the length of it."""
             length = setting.lengths[self.share]
             return after_friction(
                 setting.friction, time, length, y, setting.args, impulse
             )
 
         if setting.surface is None:
-            p = after_bath(impulse)
+            p = after_bath(noise_impulse)
         else:
             moving = moving.with_normal_space(setting.surface)
-            if impulse is None:
-                impulse = jtu.tree_map(jnp.zeros_like, p)
+            if noise_impulse is None:
+                noise_impulse = jtu.tree_map(jnp.zeros_like, p)
             p = _tangent_after_bath(
                 setting.surface,
                 moving.normal_space,  # pyright: ignore
                 after_bath,
-                impulse,
+                noise_impulse,
             )
         moving = moving._replace(y=(p, q), num_baths=moving.num_baths + 1)
         return moving, None, None
@@ -300,27 +304,31 @@ def _tangent_after_bath(
     surface: Surface,
     normal_space: NormalSpace,
     after_bath: Callable[[PyTree[Array]], PyTree[Array]],
-    impulse: PyTree[Array],
+    noise_impulse: PyTree[Array],
 ) -> PyTree[Array]:
-    """The tangent momenta after friction and noise. `after_bath(impulse)` are the momenta
-    after friction with this impulse, which changes them as noise does."""
-    flat_impulse, unravel = jfu.ravel_pytree(impulse)
+    """The momenta after friction, noise and those constraint forces that make them tangent
+    to the surface. `after_bath(impulse)` are the momenta after friction and an impulse, of
+    noise or constraint forces. It is linear in the impulse, up to a constant."""
+    flat_noise_impulse, unravel = jfu.ravel_pytree(noise_impulse)
 
     def flat_after_bath(impulse: Array) -> Array:
         return jfu.ravel_pytree(after_bath(unravel(impulse)))[0]
 
-    # Friction acts on the impulses of the constraint forces, too: then friction and noise
-    # are the midpoint rule within the tangent space, which keeps its Maxwell distribution.
+    # The impulses of the constraint forces enter as that of the noise does, so that
+    # friction acts on them, too: then friction and noise are the midpoint rule within the
+    # tangent space, which keeps its Maxwell distribution.
     def response(normal: Array) -> Array:
-        _, change_of_p = jax.jvp(flat_after_bath, (flat_impulse,), (normal,))
+        """The change of the momenta by a unit impulse along this normal."""
+        _, change_of_p = jax.jvp(flat_after_bath, (flat_noise_impulse,), (normal,))
         return change_of_p
 
-    p = flat_after_bath(flat_impulse)
+    p = flat_after_bath(flat_noise_impulse)
     return unravel(surface.tangent(p, normal_space, response))
 
 
 def _rounded(elapsed: float) -> float:
-    """The sum of shares up to here, as a key: without their rounding errors."""
+    """A sum of shares without its rounding errors, so that equal sums, such as 0.1 + 0.2
+    and 0.3, are one key of `Setting.lengths` and `Setting.times`."""
     return round(elapsed, 12)
 
 
@@ -349,13 +357,13 @@ def lengths_and_times(
 
 
 def first_alike(pieces: tuple[AbstractPiece, ...]) -> tuple[int, ...]:
-    """For each piece the position of the first one that is alike, so that both share the
-    state of their flow."""
-    positions = []
+    """For each piece the number of the first piece that is alike, which is its own number
+    if none before it is. Flows that are alike share one state, kept under this number."""
+    first_numbers = []
     for piece in pieces:
         alike = [_are_alike(piece, other) for other in pieces]
-        positions.append(alike.index(True))
-    return tuple(positions)
+        first_numbers.append(alike.index(True))
+    return tuple(first_numbers)
 
 
 def _are_alike(one: AbstractPiece, other: AbstractPiece) -> bool:
@@ -366,9 +374,9 @@ def _are_alike(one: AbstractPiece, other: AbstractPiece) -> bool:
     return True
 
 
-def is_known_at_ends(pieces: tuple[AbstractPiece, ...]) -> bool:
-    """Whether forces at the end of a step are those at the start of the next one: whether
-    there is a kick before positions move, and one after they did."""
+def are_kicks_at_both_ends(pieces: tuple[AbstractPiece, ...]) -> bool:
+    """Whether there is a kick before positions move, and one after they last did. Then the
+    forces of the last kick serve for the first kick of the next step, too."""
     moves = [i for i, piece in enumerate(pieces) if piece.moves_positions]
     kicks = [i for i, piece in enumerate(pieces) if isinstance(piece, Kick)]
     return kicks[0] < moves[0] and kicks[-1] > moves[-1]

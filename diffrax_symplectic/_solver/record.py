@@ -21,17 +21,18 @@ class Record(NamedTuple):
         a heat bath whose stationary values are exact for every stable step.
     - `right_energy_unresolved`: whether noise gives a harmonic mode without friction the
         right energy for steps that do not resolve it; `None` if such steps are unstable.
-    - `most_friction`: the greatest friction, as a rate times the step, up to which the
-        stationary energies of a resolved harmonic mode in a heat bath are within a tenth,
-        of those in `examples/stability/friction.py`; `None` if there is no limit. Given
-        for the solvers that `suggest_solver` returns.
+    - `most_friction`: the greatest friction, as a rate times the step, for which the
+        stationary energies of a resolved harmonic mode in a heat bath are right to within a
+        tenth, among the values that `examples/stability/friction.py` tries; `None` if there
+        is no limit. Given for the solvers that `suggest_solver` returns.
     - `most_frequency`: the largest frequency of the drift, as omega h, up to which two
         levels were measured to hold their error bars; `None` if nothing is promised.
 
     The last four are measured, in `tests/test_advice.py`, for the solvers that
     `suggest_solver` returns. Leave them out for others: the page then promises and warns of
-    nothing. The random variables of `LevyAreaMidpoint` have no finite set of outcomes, so
-    it states those of the midpoint rule, which a test compares its steps with.
+    nothing. For `LevyAreaMidpoint` they cannot be computed, since its random variables have
+    no finite set of outcomes: its record repeats that of the midpoint rule, and a test
+    compares the steps of both.
     """
 
     weak: Order

@@ -40,11 +40,11 @@ from .flow import (
 )
 from .pieces import (
     AbstractPiece,
+    are_kicks_at_both_ends,
     Bath,
     first_alike,
     Flight,
     Flow,
-    is_known_at_ends,
     Kick,
     lengths_and_times,
     Moving,
@@ -81,7 +81,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
     pieces: AbstractVar[tuple[AbstractPiece, ...]]
 
     def _first_alike(self) -> tuple[int, ...]:
-        """For each piece the position of the first one that is alike."""
+        """For each piece the number of the first one that is alike."""
         return first_alike(self.pieces)
 
     @property
@@ -92,8 +92,8 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
     @property
     def symmetric(self) -> bool:
         """Whether the pieces are the same in reverse."""
-        positions = self._first_alike()
-        return positions == positions[::-1]
+        numbers = self._first_alike()
+        return numbers == numbers[::-1]
 
     @property
     def has_flow(self) -> bool:
@@ -104,7 +104,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
     def kicks_at_ends(self) -> bool:
         """Whether a step kicks before positions move and after they did, so that it needs
         forces at its end only."""
-        return is_known_at_ends(self.pieces)
+        return are_kicks_at_both_ends(self.pieces)
 
     @property
     def _baths(self) -> list[Bath]:
@@ -112,12 +112,12 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
 
     @property
     def _flows(self) -> dict[int, Flow]:
-        """The flows, each once, by their positions."""
+        """The flows, each once, by the number of the first piece that is this flow."""
         flows = {}
-        for position, piece in enumerate(self.pieces):
-            is_first = self._first_alike()[position] == position
+        for number, piece in enumerate(self.pieces):
+            is_first = self._first_alike()[number] == number
             if isinstance(piece, Flow) and is_first:
-                flows[position] = piece
+                flows[number] = piece
         return flows
 
     def area_factor(self, rate_times_step: ArrayLike) -> Any:
@@ -180,9 +180,9 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         if self.kicks_at_ends and setting.kicks:
             forces, _ = rate(setting.kicks, t0, y0, args)
         flows: list[PyTree] = [None for _ in self.pieces]
-        for position, piece in self._flows.items():
+        for number, piece in self._flows.items():
             length = setting.lengths[piece.share]
-            flows[position] = begin_flow(
+            flows[number] = begin_flow(
                 piece.flow, setting.rest, t0, t1, length, y0, args
             )
         return SplittingState(forces, flows, outcome)
@@ -199,7 +199,8 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         )
         if constraint is None:
             return setting
-        # Solvers find the constraint at the first of the terms that they follow.
+        # A solver that is the flow gets only the terms in `rest`, so one of them has to
+        # carry the constraint.
         first, *others = rest
         first = wrapped_like(first, with_constraint(unwrapped(first), constraint))
         surface = Surface.of(terms, t0, y0, args)
@@ -213,8 +214,10 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         variables = drawn_variables(noise, names, t0, t1, type(self).__name__)
         if names == ["W"]:
             return [variables["W"]]
-        # H is independent of W, with a variance of h / 12. So these are independent, with
-        # the variances of their shares, and their sum is W.
+        # W and H are independent, with the variances h and h / 12. So with the share s and
+        # w^2 = 12 s (1 - s), the first part s W + w H has the variance (s^2 + w^2 / 12) h =
+        # s h. The rest, (1 - s) W - w H, has the variance (1 - s) h, and the covariance of
+        # both is (s (1 - s) - w^2 / 12) h = 0.
         share, _ = [bath.share for bath in self._baths]
         weight = math.sqrt(12 * share * (1 - share))
 
@@ -252,14 +255,15 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
             forces = forces_at_start(forces, made_jump, compute_forces)
         moving = Moving(y0, forces)
         flow_results = {}
-        for position, piece in zip(self._first_alike(), self.pieces):
+        for number, piece in zip(self._first_alike(), self.pieces):
             moving, flow_state, result = piece.move(
-                setting, moving, flow_states[position]
+                setting, moving, flow_states[number]
             )
-            flow_states[position] = flow_state
-            # The last result tells of all, since the state of a flow keeps a failure.
+            flow_states[number] = flow_state
+            # Of pieces that share a flow state only the last result is kept: after a
+            # failure this state makes all further results failures, too.
             if result is not None:
-                flow_results[position] = result
+                flow_results[number] = result
         R: Any = diffrax.RESULTS
         if setting.surface is None:
             result = result_of(None, moving.y)
@@ -359,7 +363,9 @@ class Splitting(AbstractLangevinSplitting):
 
 
 def _checked_pieces(pieces: Any) -> tuple[AbstractPiece, ...]:
-    """The pieces as a tuple. Raises a `ValueError` unless they are those of a splitting."""
+    """The pieces as a tuple. Raises a `ValueError` unless they are kicks, baths, and either
+    flights or flows, the shares of each kind add up to one, and there are at most two
+    baths."""
     if not isinstance(pieces, list | tuple):
         raise ValueError(f"`pieces` must be a list of pieces; got {pieces!r}.")
     for piece in pieces:
@@ -370,9 +376,9 @@ def _checked_pieces(pieces: Any) -> tuple[AbstractPiece, ...]:
             )
         if isinstance(piece, Flow):
             check_has_no_bath(piece.flow)
-    kinds = [Kick, Bath]
-    kinds.append(Flow if any(isinstance(x, Flow) for x in pieces) else Flight)
-    if any(not isinstance(piece, tuple(kinds)) for piece in pieces):
+    has_flow = any(isinstance(piece, Flow) for piece in pieces)
+    kinds = (Kick, Bath, Flow if has_flow else Flight)
+    if any(not isinstance(piece, kinds) for piece in pieces):
         raise ValueError(
             "A `Splitting` with a `Flow` has no `Flight`: the flow moves the positions."
         )

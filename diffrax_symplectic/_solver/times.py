@@ -13,10 +13,10 @@ from .._custom_types import RealScalarLike
 from .._terms import brownian_paths
 
 
-# Diffrax merges the remainder of a solve into its last step if it is shorter than a hundred
-# units in the last place of `t1`. So a step is at least so many units in the last place of
-# the times between which a solve goes.
-_SHORTEST_STEP = 100
+# A step has at least so many units in the last place (ulps) of the times between which a
+# solve goes. Diffrax sees to it for the last step: it merges a shorter remainder into the
+# step before.
+_LEAST_ULPS = 100
 _OUTSIDE = (
     "A step begins before `path.t0` or ends after `path.t1` of a Brownian path, which has "
     "no noise there. Solve between these times, or pass a longer path."
@@ -27,9 +27,9 @@ def check_resolution(h: float, t0: float, t1: float, dtype: Any) -> None:
     """Raises a `ValueError` for steps of size `h` between `t0` and `t1` that are too short
     for times of this dtype: `result_with_times_checked` would report each as failed."""
     rounding = float(jnp.finfo(dtype).eps) * max(abs(t0), abs(t1))
-    if h < _SHORTEST_STEP * rounding:
+    if h < _LEAST_ULPS * rounding:
         raise ValueError(
-            f"Steps of {h:g} are shorter than {_SHORTEST_STEP} times the rounding of the "
+            f"Steps of {h:g} are shorter than {_LEAST_ULPS} times the rounding of the "
             f"time in {dtype} at t0={t0} and t1={t1}. Call `jax.config.update("
             '"jax_enable_x64", True)` first, take longer steps, or start at `t0=0`.'
         )
@@ -49,7 +49,7 @@ def result_with_times_checked(
     h = t1 - t0
     # The times of a single step may be integers.
     eps = float(jnp.finfo(jnp.result_type(t0, jnp.float32)).eps)
-    is_too_short = h < _SHORTEST_STEP * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
+    is_too_short = h < _LEAST_ULPS * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     result = R.where(is_too_short, R.dt_min_reached, result)
     for path in brownian_paths(terms):
         # Most paths have no ends, so that nothing needs to be checked when run. Ends that
@@ -62,7 +62,7 @@ def result_with_times_checked(
         begin = jnp.where(forward, t0, -t1)
         end = jnp.where(forward, t1, -t0)
         # Times are rounded, so that a step may begin just before the path or end just after
-        # it. A hundredth of the step is at least one rounding: see `_SHORTEST_STEP`.
+        # it. A hundredth of the step is at least one rounding: see `_LEAST_ULPS`.
         slack = 0.01 * h
         is_outside = (begin < path.t0 - slack) | (end > path.t1 + slack)
         result = eqx.error_if(result, is_outside, _OUTSIDE)

@@ -31,7 +31,8 @@ class AbstractCaller(eqx.Module):
         or their shapes. A field may hold a constant in place of a function."""
 
 
-# Parts that call functions, and are none that a user wrote.
+# What holds functions of the user and calls them. These are no functions of the user
+# themselves, also where they stand in place of one, such as a `Drift` in an `ODETerm`.
 _PARTS = AbstractCaller, diffrax.AbstractTerm, diffrax.AbstractSolver
 _TERMS_OF_DIFFRAX = (
     diffrax.ODETerm,
@@ -43,10 +44,11 @@ _TERMS_OF_DIFFRAX = (
 
 
 def with_programs(terms: _T, t: RealScalarLike, y: Y, args: Args) -> _T:
-    """The terms, or a solver, with a program in place of each function of the user, as it
-    is now. What JAX keeps for the terms that are returned holds for all whose functions
-    compute the same. Raises what these functions raise for such a state, and a `ValueError`
-    if it is no pair and has to be one."""
+    """The terms, or a solver, with each function of the user replaced by a program of what
+    it computes now. Functions that compute the same have equal programs, so what JAX has
+    compiled for the terms that are returned serves for all such functions. Raises what the
+    functions raise for such a state, and a `ValueError` for a state that is no pair where
+    the terms need one."""
     y = jtu.tree_map(jnp.asarray, y)
     t = jnp.asarray(t, jnp.result_type(*jtu.tree_leaves(y)))
     programs: dict[int, Any] = {}
@@ -57,7 +59,8 @@ def with_programs(terms: _T, t: RealScalarLike, y: Y, args: Args) -> _T:
             programs[id(part)] = _TracedTerm.of(part, t, y, args)
         for name, inputs in _called_with(part, t, y, args).items():
             fn = getattr(part, name)
-            # A function may stand in several places, as the energy of a heat bath does.
+            # A function may stand in several places, as the energy of a heat bath does. It
+            # is traced once.
             if callable(fn) and not isinstance(fn, _PARTS) and id(fn) not in programs:
                 programs[id(fn)] = _program(part, name, inputs)
 
@@ -106,6 +109,7 @@ def _program(part: Any, name: str, inputs: tuple[Any, ...]) -> Callable:
 
 
 def _call(name: str, fn: Callable, *inputs: Any) -> PyTree[Array]:
+    """`fn(*inputs)` for the user's function of this name. The last input is `args`."""
     *others, args = inputs
     return call_user_function(name, fn, *others, args=args)
 
@@ -119,7 +123,8 @@ def _traced_field(
         return traced(fn, t, y, args, identity=identity)
     struct = field.in_structure()
 
-    # An operator may hold a function, which is no result of a program.
+    # A program returns arrays alone, and an operator may hold a function. So the program is
+    # that of the product of the operator with a control.
     product = jtu.Partial(_product, fn)
     return _OperatorField(
         traced(product, t, y, args, struct, identity=identity), struct
@@ -127,8 +132,9 @@ def _traced_field(
 
 
 def _product(fn: Callable, *inputs: Any) -> Y:
-    *state, control = inputs
-    return fn(*state).mv(control)
+    """The operator `fn(t, y, args)` times the control, which is the last of the inputs."""
+    *t_y_args, control = inputs
+    return fn(*t_y_args).mv(control)
 
 
 class _OperatorField(eqx.Module):

@@ -26,9 +26,9 @@ KEEP = (
 class ConstrainedDrift(diffrax.AbstractTerm, AbstractCaller):
     """The drift of Hamiltonians for positions with `constraint(q, args) = 0`.
 
-    Its vector field depends on multipliers that a solver has to find. So the product with
-    the length of a step raises an error, which every solver meets that does not know of
-    constraints, also those of Diffrax. The solvers that do read the fields of the term.
+    Its vector field depends on multipliers, which only some solvers find. These read the
+    fields of the term. All others, also those of Diffrax, ask for the product of the vector
+    field with the length of a step, which raises an error.
     """
 
     drift: diffrax.AbstractTerm
@@ -43,7 +43,7 @@ class ConstrainedDrift(diffrax.AbstractTerm, AbstractCaller):
 
     def vf(self, t, y, args) -> PyTree[Array]:
         # Diffrax looks at the structure of the vector field before any solve, so the error
-        # cannot be raised here. The values must not be used.
+        # cannot be raised here. The values must not be used, hence NaN.
         return jtu.tree_map(_nan_like, y)
 
     def contr(self, t0, t1, **kwargs) -> Any:

@@ -140,7 +140,7 @@ def _is_elementwise(eqn: Any, sources: Sequence[_Source]) -> bool:
     if any(x.aval.shape != shape for x in tracked):
         return False
     if eqn.primitive.name == "dot_general":
-        # The derivative of `p @ p` multiplies by a scalar in this way.
+        # A product with a single number, as in the derivative of `p @ p`, sums no entries.
         return len(tracked) == 1 and any(x.aval.size == 1 for x in eqn.invars)
     # These two keep the entries if they keep the shape, as they do here.
     if eqn.primitive.name in ("reshape", "broadcast_in_dim"):

@@ -71,8 +71,8 @@ def ito_drift(*noise: diffrax.AbstractTerm) -> diffrax.ODETerm:
 class _ItoDrift(eqx.Module):
     """The vector field of `ito_drift`.
 
-    - `leaves`, `structure`: those of the noise terms. Taken apart, they are not found by
-        what looks for noise and its Hamiltonians among the terms.
+    - `leaves`, `structure`: the noise terms, flattened. As terms they would be found by the
+        functions that look for noise and its Hamiltonians in a PyTree of terms.
     - `motions`: the number of the Brownian motion that drives each of the terms.
     """
 
@@ -85,13 +85,14 @@ class _ItoDrift(eqx.Module):
         structs = map(increment_struct, brownian_paths(noise))
         zeros, unravel = zeros_and_unravel(dict(zip(self.motions, structs)))
 
-        def along(unit: Float[Array, " n"]) -> Y:
-            """`b_k' b_k` for the noise whose increment is one."""
+        def derivative_along_itself(unit: Float[Array, " n"]) -> Y:
+            """`b_k' b_k` for the noise `k` whose increment in `unit` is one."""
             increments = unravel(unit)
             controls = [increments[motion] for motion in self.motions]
             field = ft.partial(apply, noise, controls, args, t)
             _, change = jax.jvp(field, (y,), (field(y),))
             return change
 
-        changes = jax.vmap(along)(jnp.eye(zeros.size, dtype=zeros.dtype))
+        units = jnp.eye(zeros.size, dtype=zeros.dtype)
+        changes = jax.vmap(derivative_along_itself)(units)
         return jtu.tree_map(lambda change: -jnp.sum(change, axis=0) / 2, changes)

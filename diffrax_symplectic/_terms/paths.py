@@ -96,8 +96,8 @@ def motion_numbers(paths: Sequence[diffrax.AbstractBrownianPath]) -> tuple[int, 
     motions: list[diffrax.AbstractBrownianPath] = []
     numbers = []
     for path in paths:
-        equal = (k for k, motion in enumerate(motions) if _are_equal(path, motion))
-        number = next(equal, None)
+        matches = (k for k, motion in enumerate(motions) if _are_equal(path, motion))
+        number = next(matches, None)
         if number is None:
             number = len(motions)
             motions.append(path)

@@ -125,8 +125,9 @@ class _Motion(NamedTuple):
 def outcomes(
     laws: Sequence[AbstractLaw], num_nodes: int
 ) -> tuple[Float[np.ndarray, "K n"], Float[np.ndarray, " K"]]:
-    """All values of independent variables with these laws, and their probabilities, or for
-    Gaussian variables the points and weights of a quadrature with `num_nodes` in each."""
+    """All K outcomes of n independent variables with these laws, a row for each, and their
+    probabilities. For Gaussian variables the outcomes are the points of a quadrature, with
+    `num_nodes` in each variable, and the probabilities its weights."""
     values_of_each = []
     weights_of_each = []
     for law in laws:

@@ -315,9 +315,9 @@ def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
     return asserted.pop() if len(asserted) == 1 else None
 
 
-def structure_asserted_in(term: diffrax.AbstractTerm) -> str | None:
-    """The function that made a term from Hamiltonians, and that takes the `structure` of
-    these; `None` for other terms."""
+def name_of_maker(term: diffrax.AbstractTerm) -> str | None:
+    """The name of the function of this package that made a term from Hamiltonians and takes
+    their `structure`, such as `"langevin_terms"`; `None` for other terms."""
     drifts = [part for part in _hamiltonian_parts(term) if isinstance(part, Drift)]
     if len(drifts) > 0:
         return drifts[0].made_by

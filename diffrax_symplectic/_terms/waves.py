@@ -132,7 +132,8 @@ class _DampedWaves(AbstractCaller):
         vectors = jnp.shape(q)[:-1]
         alpha = damping_for(_EACH, self.alpha, vectors, jnp.result_type(q))
         # The state is real: g = (by_q + i by_p) / sqrt(2) and psi = (q + i p) / sqrt(2). So
-        # `real` and `imaginary` are the parts of 2 g^+ psi, and `squares` is 2 psi^+ psi.
+        # `real` and `imaginary` are the parts of 2 g^+ psi, and `squares` is 2 psi^+ psi;
+        # half of alpha makes up for the 2.
         half_alpha = alpha[..., None] / 2
         real = _dot(by_q, q) + _dot(by_p, p)
         imaginary = _dot(by_q, p) - _dot(by_p, q)

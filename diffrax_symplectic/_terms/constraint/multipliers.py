@@ -76,16 +76,18 @@ def find_multipliers(
         # At most, this correction and the one before change each constraint by so much.
         change = weighted_sum(jnp.abs(newton.change), slopes)
         change_before = weighted_sum(jnp.abs(state.correction), slopes) + rounding
-        # The change of the derivative along the correction before: its old value is the
-        # residual before. It has the units of each constraint, so that none hides others.
+        # The change of the derivative along the correction before. The old derivative times
+        # that correction was `state.residual`, the residual that it was to remove. The
+        # change has the units of each constraint, so that none hides others.
         bend = jnp.abs(newton.derivative(state.correction) - state.residual)
         # The next correction is at most this fraction of this one. (Half of the bend is
         # what was left to this one, and the square of the ratio of both is left to the
         # next: Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.)
         fraction = max_norm(change / change_before) * max_norm(bend / change_before)
-        # The first correction has none before it.
+        # The first correction has none before it, and so no estimate of the next.
         fraction = jnp.where(state.remaining < _MOST_STEPS, fraction, 1)
-        # The inequality is strict, since infinite corrections solve nothing.
+        # The inequality is strict, since infinite corrections, for which both sides are
+        # infinite, solve nothing.
         is_solved = jnp.all(change * fraction < rounding + relative_rounding * change)
         failed = jnp.any(jnp.isnan(change))
         remaining = jnp.where(failed, 0, state.remaining - 1)
@@ -131,9 +133,11 @@ def weighted_sum(x: Multipliers, vectors: Float[Array, "c n"]) -> Vector:
 # Sums over axes up to this length are unrolled, so that XLA fuses them. On CPUs it calls a
 # library for each other sum or product of matrices: steps of rigid dimers took three times
 # as long.
-_SHORT = 32
+_MOST_UNROLLED = 32
 
 
 def _total(x: Float[Array, "n ..."]) -> Float[Array, "..."]:
     """The sum over the first axis."""
-    return ft.reduce(operator.add, x) if len(x) <= _SHORT else jnp.sum(x, axis=0)
+    return (
+        ft.reduce(operator.add, x) if len(x) <= _MOST_UNROLLED else jnp.sum(x, axis=0)
+    )

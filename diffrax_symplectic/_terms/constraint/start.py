@@ -49,8 +49,8 @@ def check_start(
     """Raises a `ValueError` unless masses are constant, if the constraints are dependent at
     `y0`, or if `y0` is off them.
 
-    Returns the last two as flags. Of traced values a flag that is true raises an error when
-    run, unless it is that of a path in a batch, which then has to fail."""
+    Returns the last two as flags, since values may be traced. A flag that is then true is
+    an error when run, except in a batch: there the caller makes its path fail."""
     _check_constant_masses(terms, t0, y0, args)
     # Under `grad` a derivative of the flags would be traced, which is zero.
     fixed_y0, fixed_args = jtu.tree_map(_without_derivative, (y0, args))

@@ -107,7 +107,10 @@ class Surface(NamedTuple):
         response: Callable[[Vector], Vector] | None = None,
     ) -> Vector:
         """The tangent momentum: `p` after those impulses of the constraint forces that make
-        it tangent. An impulse changes the momentum by itself, or by its `response`."""
+        it tangent. An impulse `x` changes the momentum by `x`; or by `response(x)`, for
+        example if friction acts on it, too."""
+        # The change of the momentum by a unit impulse along each normal, (c, n), and the
+        # change of J v by it.
         if response is None:
             gram = normal_space.gram
             changes = normal_space.normals
@@ -163,10 +166,13 @@ class Surface(NamedTuple):
         # In a solve backward in time velocities, and with them the matrix, change their
         # sign.
         gram = normal_space.gram * jnp.sign(jnp.trace(normal_space.gram))
-        size = jnp.sqrt(jnp.diag(gram))
-        # A pivot is the squared sine of the angle between a normal and the ones before it.
-        pivots = jnp.diag(jnp.linalg.cholesky(gram / size / size[:, None])) ** 2
+        lengths = jnp.sqrt(jnp.diag(gram))
+        # The cosines of the angles between normals. The pivots of their Cholesky factor are
+        # the squared sines of the angles between each normal and the space of those before.
+        cosines = gram / lengths / lengths[:, None]
+        pivots = jnp.diag(jnp.linalg.cholesky(cosines)) ** 2
         rounding = 1000 * jnp.finfo(gram.dtype).eps
+        # NaN, of a normal that is zero or a factor that does not exist, is not greater.
         return ~jnp.all(pivots > rounding)
 
     def is_off(self, p: Vector, normal_space: NormalSpace) -> Bool[Array, ""]:
@@ -176,6 +182,8 @@ class Surface(NamedTuple):
         eps = float(jnp.finfo(p.dtype).eps)
         bound = eps ** (2 / 3)
         q = normal_space.q
+        # The size of the terms that cancel in each constraint, by the size of the positions
+        # or, near the origin, by the curvature of the surface.
         size = jnp.maximum(
             _rounding(normal_space, q) / eps, self._size_by_curvature(normal_space)
         )
@@ -203,7 +211,8 @@ class Surface(NamedTuple):
 
 
 def _rounding(normal_space: NormalSpace, q: Vector) -> Multipliers:
-    """The change of each constraint by one unit in the last place of each position `q`."""
+    """The rounding error of each constraint: the most that it changes if all positions `q`
+    change by one unit in the last place."""
     info = jnp.finfo(q.dtype)
     last_places = float(info.eps) * jnp.abs(q)
     changes = products(jnp.abs(normal_space.normals), last_places[None])[:, 0]

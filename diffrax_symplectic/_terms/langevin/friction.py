@@ -87,13 +87,14 @@ def value_at(name: str, value: Any, t, q: _Momenta, args: Args) -> Any:
 def product_with(
     friction: Any, t, q: _Momenta, args: Args, velocity: _Momenta
 ) -> _Momenta:
-    """`G v`."""
+    """`G v` for the user's `friction` G in any of its forms. NaN where numbers are
+    negative, or a constant matrix is not semidefinite."""
     if isinstance(friction, FrictionAlong):
-        # Products with the directions cost less than one with a matrix. Each array of
-        # momenta adds its part to the speeds along the directions.
+        # G v = sum_k d_k (d_k . v), which costs less than to form the matrix. In the scalar
+        # products each array of momenta is one summand.
         columns = _checked_columns(friction, t, q, args)
-        parts = jtu.tree_leaves(jtu.tree_map(_speeds_along, columns, velocity))
-        return jtu.tree_map(lambda directions: directions @ sum(parts), columns)
+        speeds = jtu.tree_leaves(jtu.tree_map(_speeds_along, columns, velocity))
+        return jtu.tree_map(lambda directions: directions @ sum(speeds), columns)
     value = value_at("friction", friction, t, q, args)
     if isinstance(value, _Matrix):
         force = _product_with_matrix(value.operator, q, velocity)
@@ -101,7 +102,7 @@ def product_with(
             lambda x: jnp.where(value.is_semidefinite, x, jnp.nan), force
         )
     if isinstance(value, lx.AbstractLinearOperator):
-        # Whether it is semidefinite is seen when its root is taken.
+        # Whether it is semidefinite is checked where the noise takes its root.
         return _product_with_matrix(value, q, velocity)
     values = _checked_numbers("friction", value, q)
     return jtu.tree_map(
@@ -109,9 +110,10 @@ def product_with(
     )
 
 
-def _speeds_along(directions: Array, v: Array) -> Array:
-    """The scalar product of each direction with the velocity; the last axis of `directions`
-    numbers them."""
+def _speeds_along(
+    directions: Float[Array, "*shape m"], v: Float[Array, "*shape"]
+) -> Float[Array, " m"]:
+    """The scalar product of each direction with the velocity."""
     return jnp.tensordot(v, directions, axes=jnp.ndim(v))
 
 
@@ -220,19 +222,20 @@ def _checked_columns(friction: FrictionAlong, t, q: _Momenta, args: Args) -> _Mo
 
 
 def _checked_numbers(
-    name: str, value: PyTree, momenta: PyTree, which: str = "its momenta"
+    name: str, value: PyTree, momenta: PyTree, called: str = "its momenta"
 ) -> PyTree:
-    """The user's argument `name`, a friction or a temperature by numbers, for each array of
-    the `momenta`, or of a path, as `which` says for messages. Raises a `ValueError` unless
-    it is a number or an array that repeats along axes of these."""
+    """The friction or temperature in the user's argument `name`, as numbers for each array
+    of the `momenta`. Raises a `ValueError` unless these are a single number or an array
+    that repeats along axes of the momenta. Messages call the momenta `called`, since a path
+    may stand in for them."""
     values = _value_for_each(name, value, momenta)
     for x, of_momenta in zip(jtu.tree_leaves(values), jtu.tree_leaves(momenta)):
-        _check_broadcasts(name, jnp.shape(x), jnp.shape(of_momenta), which)
+        _check_broadcasts(name, jnp.shape(x), jnp.shape(of_momenta), called)
     return values
 
 
 def _check_broadcasts(
-    name: str, shape: tuple[int, ...], momenta_shape: tuple[int, ...], which: str
+    name: str, shape: tuple[int, ...], momenta_shape: tuple[int, ...], called: str
 ) -> None:
     """Raises a `ValueError` unless an array of this shape has one number for all momenta,
     or as many axes as these, each as long as theirs or one. (NumPy would also add axes in
@@ -250,17 +253,17 @@ def _check_broadcasts(
     if name == "friction" and len(shape) > 1:
         advice += f" Pass {_PASS_MATRIX}."
     raise ValueError(
-        f"An array of `{name}` must have the shape of {which}, {momenta_shape}, in which "
+        f"An array of `{name}` must have the shape of {called}, {momenta_shape}, in which "
         f"any axis may have length one, or be a single number; got shape {shape}.{advice}"
     )
 
 
 def _check_matrix(
-    operator: lx.AbstractLinearOperator, momenta: PyTree, which: str
+    operator: lx.AbstractLinearOperator, momenta: PyTree, called: str
 ) -> None:
     """Raises a `ValueError` unless the operator is tagged as positive semidefinite, and
-    maps PyTrees with the structure and shapes of `momenta` to themselves. `which` says for
-    the message what these are."""
+    maps PyTrees with the structure and shapes of `momenta` to such PyTrees. The message
+    calls these `called`."""
     if not lx.is_positive_semidefinite(operator):
         raise ValueError(
             "The operator of `friction` must be tagged as positive semidefinite: pass "
@@ -269,7 +272,7 @@ def _check_matrix(
     structure = operator.in_structure()
     if not _same_shapes(structure, momenta):
         raise ValueError(
-            f"The operator of `friction` must act on arrays with the shape of {which}, "
+            f"The operator of `friction` must act on arrays with the shape of {called}, "
             f"{shapes(momenta)}; got one for shape {shapes(structure)}. For momenta of "
             "shape `(n, d)` pass `lineax.PyTreeLinearOperator(array, jax.eval_shape("
             "lambda: q), lineax.positive_semidefinite_tag)` with an array of shape "
@@ -352,7 +355,8 @@ def checked_friction(
             f"{friction!r}."
         )
     if path_struct is not None:
-        # Which of them is wrong, if they differ, is not known before the solve.
+        # The momenta are not known before the solve, and if their shape is another than the
+        # path's, either may be wrong: the message names both.
         _checked_numbers(
             "friction", friction, path_struct, "the `path` and the momenta"
         )
@@ -412,12 +416,16 @@ def semidefinite_root(square: Float[Array, "n n"]) -> Float[Array, "n n"]:
     n = len(square)
     eps = jnp.finfo(square.dtype).eps
     diagonal = jnp.diag(square)
-    # The error of a pivot, which is a difference of numbers up to the diagonal entry.
+    # The error of a pivot, which is a difference of numbers up to the diagonal entry. A
+    # column is left out where its pivot is not larger.
     rounding = 10 * n * eps * diagonal
-    # If the matrix is semidefinite, no entry of the remainder at the end, when all pivots
-    # are tiny, is larger than this.
-    size = jnp.sqrt(jnp.maximum(diagonal, 0))
-    largest_remainder = 10 * (n * eps) ** 0.5 * size[:, None] * size
+    # No entry (i, j) of a semidefinite matrix is larger than the root of the product of the
+    # diagonal entries i and j. One of these is below `rounding` where a column was left
+    # out, which gives a bound on what is left of a semidefinite matrix at the end.
+    root_of_diagonal = jnp.sqrt(jnp.maximum(diagonal, 0))
+    largest_remainder = (
+        10 * (n * eps) ** 0.5 * root_of_diagonal[:, None] * root_of_diagonal
+    )
 
     def with_column(j: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
         """The remainder of the matrix after column `j` of the root, the root with this

@@ -72,8 +72,9 @@ def _breaks_structure(
     - separable, of a drift: derivatives of dp by p, and of dq by q and t.
     """
     zeros, unravel = zeros_and_unravel((y0, control_struct(term, t0)))
-    # A bound between rounding errors, also of long sums, and any real mistake. Times may
-    # have more digits than the state, so the dtype of the state decides.
+    # A bound, as a fraction of the largest value or derivative, between rounding errors,
+    # also of long sums, and any real mistake. Times may have more digits than the state, so
+    # the dtype of the state decides.
     eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).eps)
     threshold = eps ** (2 / 3)
 
@@ -109,7 +110,7 @@ def _breaks_structure(
             forbidden = [dp_by_p, dq_by_q, dq_by_t]
         of_p = [dp, dp_by_p, dp_by_q, dp_by_t]
         of_q = [dq, dq_by_p, dq_by_q, dq_by_t]
-        # Values that are not finite compare as false: they tell nothing.
+        # With NaN, or infinity on both sides, this is false: such values tell nothing.
         return largest_entry(forbidden) > threshold * largest_entry([of_p, of_q])
 
     directions = jr.normal(jr.key(0), (_NUM_DIRECTIONS, zeros.size), zeros.dtype)

@@ -26,7 +26,7 @@ from ..symplectic_gradients import (
     asserted_structure,
     AssertedStructure,
     is_hamiltonian,
-    structure_asserted_in,
+    name_of_maker,
 )
 from ..vector_fields import check_increments
 from .assertion import contradicts_assertion
@@ -63,9 +63,10 @@ class Fault(NamedTuple):
     - `cause`: what is wrong, as a part of a sentence.
     - `advice`: what to do, in sentences.
     - `friction`: whether all that is wrong is a force of plain terms that depends on the
-        momentum, such as friction; with `wrong_way_round`, after the exchange.
-    - `wrong_way_round`: whether nothing else would be wrong with the halves of the state
-        exchanged.
+        momentum, such as friction; with `wrong_way_round`, all that is wrong once the
+        halves of the state are exchanged.
+    - `wrong_way_round`: whether with the halves of the state exchanged nothing would be
+        wrong, or friction alone.
     """
 
     cause: str
@@ -139,8 +140,8 @@ def separable_fault(
         to_trace = _not_asserted(terms, "separable")
         return [_Traced(term, _dependence(term, t0, y0, args)) for term in to_trace]
 
-    # A drift without its friction is still one of a Hamiltonian, whose faults are named by
-    # its derivatives.
+    # Friction of `langevin_terms` is taken apart from its drift, which then is one of a
+    # Hamiltonian, so that its faults are named as those of derivatives of H0.
     frictionless, friction = friction_apart(drift)
     if fault := _wrong_assertion("separable", frictionless, noise, t0, y0, args):
         return fault
@@ -154,14 +155,15 @@ def separable_fault(
     if len(faults) == 0:
         return None
     first = faults[0]
-    with_friction = first._replace(advice=f"{FRICTION} {first.advice}", friction=True)
+    by_friction = first._replace(advice=f"{FRICTION} {first.advice}", friction=True)
     if all(fault.friction for fault in faults):
-        return with_friction
+        return by_friction
     if len(faults_if_exchanged) == 0:
         return first._replace(friction=False, wrong_way_round=True)
-    # For (position, velocity), the order of many other packages, only friction is wrong.
+    # The state is (position, velocity), the order of many other packages, with friction.
     if all(fault.friction for fault in faults_if_exchanged):
-        return with_friction._replace(wrong_way_round=True)
+        return by_friction._replace(wrong_way_round=True)
+    # Something other than friction is wrong in both orders.
     return first._replace(friction=False)
 
 
@@ -317,9 +319,10 @@ def check_stratonovich(
     *,
     all_terms: bool = False,
 ) -> None:
-    """Raises a `ValueError` if an Ito solver gets terms in the sense of Stratonovich: those
-    from Hamiltonians, and in `expectation` `all_terms`. Both senses agree for additive
-    noise, and for noise that changes only `p` and depends only on `q`."""
+    """Raises a `ValueError` if an Ito solver gets noise that is meant in the sense of
+    Stratonovich, where the two senses differ. Noise of Hamiltonians is meant so, and with
+    `all_terms`, as in `expectation`, all noise. The senses agree for additive noise, and
+    for noise that changes only `p` and depends only on `q`."""
     if not isinstance(solver, diffrax.AbstractItoSolver):
         return
     drift, noise = split_terms(terms)
@@ -359,7 +362,8 @@ def _keeps_half(
 ) -> bool:
     """Whether a plain noise term leaves one half of the state unchanged because its matrix
     has a block of zeros that is known while tracing."""
-    # What a term of a Hamiltonian reads is known by its derivatives.
+    # A noise Hamiltonian that does not depend on a half of the state has the gradient zero
+    # by that half, which tracing has seen.
     if is_hamiltonian(term):
         return False
     struct = control_struct(term, t0)
@@ -428,7 +432,7 @@ def _wrong_assertion(
             cause = "at or near `y0` H0 mixes p and q, or dH0/dp depends on t"
         advice = (
             f'Leave `structure="{structure}"`, which is wrong here, out of '
-            f"`{structure_asserted_in(term)}`, and {_GENERAL}."
+            f"`{name_of_maker(term)}`, and {_GENERAL}."
         )
         return Fault(cause, advice)
 
@@ -447,7 +451,7 @@ def _advice(structure: AssertedStructure, term: diffrax.AbstractTerm) -> str:
         "separable": "H0 as a sum `V(p) + U(t, q)`, each summand of p or q alone",
         "additive": "each H_k as a function linear in p and q, such as `-sigma * q`",
     }[structure]
-    maker_name = structure_asserted_in(term)
+    maker_name = name_of_maker(term)
     # The structure of plain terms, and of the noise of a bath, cannot be asserted.
     if maker_name is None:
         assertion = ""

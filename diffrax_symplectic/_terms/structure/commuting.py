@@ -35,16 +35,19 @@ def noises_commute(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
         y, x, z = unravel(point)
         b_x = ft.partial(apply, noise, x, args, t0)
         b_z = ft.partial(apply, noise, z, args, t0)
-        _, first = jax.jvp(b_z, (y,), (b_x(y),))
-        _, second = jax.jvp(b_x, (y,), (b_z(y),))
-        return largest_entry(first), largest_entry((first**ω - second**ω).ω)
+        _, Db_z_b_x = jax.jvp(b_z, (y,), (b_x(y),))
+        _, Db_x_b_z = jax.jvp(b_x, (y,), (b_z(y),))
+        return largest_entry(Db_z_b_x), largest_entry((Db_z_b_x**ω - Db_x_b_z**ω).ω)
 
     try:
         with jax.disable_jit(False):
-            size, bracket = sizes(_random_points(zeros))
-            is_finite = jnp.isfinite(size) & jnp.isfinite(bracket)
+            # For each point the size of a summand of the bracket, and of the bracket.
+            of_summand, of_bracket = sizes(_random_points(zeros))
+            # Points at which these are not finite tell nothing; one other has to remain.
+            is_finite = jnp.isfinite(of_summand) & jnp.isfinite(of_bracket)
             # A bracket that cancels leaves rounding errors of its summands.
-            is_small = bracket <= 1e3 * jnp.finfo(size.dtype).eps * size
+            eps = jnp.finfo(of_summand.dtype).eps
+            is_small = of_bracket <= 1e3 * eps * of_summand
             commute = jax.block_until_ready(
                 jnp.any(is_finite) & jnp.all(is_small | ~is_finite)
             )

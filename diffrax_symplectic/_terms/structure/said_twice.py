@@ -53,12 +53,12 @@ def check_baths_have_own_noise(terms: PyTree[diffrax.AbstractTerm]) -> None:
     Brownian motion for both, the temperature would be wrong. Traced keys are not compared,
     since their values are not known."""
     noise = [term for term in flattened(terms) if len(brownian_paths(term)) > 0]
-    keys = [_known_keys(term) for term in noise]
-    for place, term in enumerate(noise):
+    keys_of_each = [_known_keys(term) for term in noise]
+    for i, term in enumerate(noise):
         if not isinstance(unwrapped(term), BathNoise):
             continue
-        other_keys = set().union(*keys[:place], *keys[place + 1 :])
-        if keys[place] & other_keys:
+        keys_of_others = set().union(*keys_of_each[:i], *keys_of_each[i + 1 :])
+        if keys_of_each[i] & keys_of_others:
             raise ValueError(
                 "The path of a bath has the same random key as the path of another term, "
                 "so both would be one Brownian motion, and the temperature would be wrong. "

@@ -22,10 +22,10 @@ def which_need_truncation(
     """For each Brownian path of the terms, whether implicit steps need its increments
     bounded: whether noise that it drives depends on the state.
 
-    Additive noise enters the equations of the stages as a constant. So does the noise of a
-    bath for constant friction; for friction that depends on positions the equations see it
-    through the positions alone, which a step of size h moves by its h-th part, and bounds
-    would cool the bath."""
+    Additive noise enters the equations of the stages as a constant, which any increment
+    may be. So does the noise of a bath with constant friction. If friction depends on
+    positions, an increment acts on it only through the positions, to which the momenta
+    carry it with the small factor h. So no bound is needed, and one would cool the bath."""
     noise = [term for term in flattened(terms) if len(brownian_paths(term)) > 0]
     # One flag for each path, in the order of `brownian_paths(terms)`.
     depends_on_state = []
@@ -52,8 +52,9 @@ def with_truncation(
     which: Sequence[bool],
     unit: Float[np.ndarray, ""] | None = None,
 ) -> PyTree[diffrax.AbstractTerm]:
-    """The terms with truncation, in this `unit` of time, in those paths of Gaussian
-    increments alone whose flag in `which`, with one for each path, is true."""
+    """The terms with a `TruncatedBrownianPath`, of this `unit` of time, in place of each
+    path whose flag in `which` is true, if its increments are Gaussian without Lévy areas.
+    `which` has a flag for each Brownian path of the terms, in order."""
     remaining_flags = iter(which)
 
     def new_path(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
