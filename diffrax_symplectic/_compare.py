@@ -46,9 +46,9 @@ from ._terms import (
 # error of the reference is then 8^(-1/2), about a third, of the error that is measured;
 # with any higher order it is less.
 _REFERENCE_STEPS = 8
-# The number of the batch of paths along which the reference is solved, and with strong
-# errors all solvers.
-_COMMON_PATHS = 0
+# The number of the batch of paths along which the reference is solved. Strong errors of all
+# solvers are measured along the same paths.
+_COMMON_BATCH = 0
 # A quotient of times counts as a whole number if it differs from one by less than this.
 _TIME_ROUNDING = 1e-6
 
@@ -228,7 +228,7 @@ def compare_solvers(
     system = _ComparedSystem(terms, t0, t1, y0, args, phi, key, num_paths)
     reference_dt = min(dts) / _REFERENCE_STEPS
     solve_for_reference = system.solve_to_compare(reference, reference_dt)
-    exact = solve_for_reference(system.keys(_COMMON_PATHS), jnp.asarray(reference_dt))
+    exact = solve_for_reference(system.keys(_COMMON_BATCH), jnp.asarray(reference_dt))
     # The results are traced if a function of the user closes over traced values.
     check_untraced("`compare_solvers`", exact)
     steps = []
@@ -263,7 +263,8 @@ class _ComparedSystem(NamedTuple):
         return jr.split(jr.fold_in(self.key, batch_number), self.num_paths)
 
     def solve_with_own_path(self, solver: diffrax.AbstractSolver) -> _SolveBatch:
-        """The function that solves along the path that the solver gets in a solve."""
+        """The function that solves along the path that the solver makes for the shape of a
+        path in `terms`."""
         want = "strong" if self.is_strong else "weak"
         return self._solve_batch(solver, ft.partial(own_path, solver, want))
 
@@ -283,7 +284,7 @@ class _ComparedSystem(NamedTuple):
         compiled."""
         terms, t0, t1, y0, args, phi, *_ = self
         solver = with_programs(solver, t0, y0, args)
-        # Terms that share a path share a path again.
+        # Terms with equal numbers get the same path, since they shared one before.
         numbers = motion_numbers(random_paths(terms))
 
         @eqx.filter_jit
@@ -318,11 +319,13 @@ def _compared_steps(
 ) -> list[ComparedStep]:
     """Measures a solver with each step size. Raises `_Refused` if it does not accept the
     terms."""
+    # Strong errors need another path than a solver gets by itself, which may take longer.
+    # So times are measured with the latter.
     timed_solve = system.solve_with_own_path(solver)
     compared_solve = timed_solve
     if system.is_strong:
         compared_solve = system.solve_to_compare(solver, reference_dt)
-    common_keys = system.keys(_COMMON_PATHS)
+    common_keys = system.keys(_COMMON_BATCH)
     try:
         # Refusals are errors while tracing, so that nothing need be compiled for them.
         eqx.filter_eval_shape(compared_solve, common_keys, jnp.asarray(dts[0]))
@@ -331,7 +334,8 @@ def _compared_steps(
     # The first call compiles, and is not timed.
     jax.block_until_ready(timed_solve(system.keys(1), jnp.asarray(dts[0])))
     steps = []
-    # Weak errors are from independent paths, so each step size has a batch of its own.
+    # Each step size has a batch of its own, since weak errors are from independent paths.
+    # (Strong ones are measured along the common batch.)
     for batch_number, dt in enumerate(dts, start=1):
         # The step size is an array: with a number the program would compile anew.
         dt_array = jnp.asarray(dt)
@@ -430,9 +434,9 @@ def _check_scalar(phi: Any, t: RealScalarLike, y0: Y, args: Args) -> None:
 
 
 def _checked_dts(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
-    """The step sizes `dts`, as numbers of Python. Raises a `ValueError` unless each is
-    positive, divides the interval, and is a multiple of the smallest, so that all follow
-    one Brownian motion."""
+    """The step sizes `dts`, as Python numbers. Raises a `ValueError` unless each is
+    positive, divides the interval, and is a multiple of the smallest, whose increments add
+    up to those of all others."""
     if not t1 > t0:
         raise ValueError(f"`t1` must be after `t0`; got t0={t0!r} and t1={t1!r}.")
     if np.ndim(dts) != 1 or len(dts) == 0:
@@ -452,5 +456,5 @@ def _checked_dts(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
 
 def _is_whole(x: float) -> bool:
     """Whether this quotient is a positive whole number, up to rounding."""
-    # Above a half, so that it does not count as zero.
+    # Numbers up to a half would be rounded to zero.
     return math.isfinite(x) and x > 0.5 and abs(x - round(x)) < _TIME_ROUNDING

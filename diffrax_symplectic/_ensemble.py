@@ -93,7 +93,7 @@ def _words_of_number(number: IntScalarLike) -> tuple[ArrayLike, ArrayLike]:
         high, low = divmod(whole_number("number", int(number), least=0), 2**32)
         return np.uint32(high), np.uint32(low)
     traced = jnp.asarray(number)
-    # If the number has 32 bits or fewer, the shift gives zero.
+    # If the integer type has 32 bits or fewer, XLA's shift by 32 gives zero, as it should.
     return (traced >> 32).astype(jnp.uint32), traced.astype(jnp.uint32)
 
 
@@ -207,7 +207,7 @@ def ensemble(
     whole = _concatenated(batches, num_paths, at_end=ts is None)
     advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
     _warn_of_failures(whole, advice)
-    # The times of the steps, from which the times of the user differ by rounding errors.
+    # The times at which steps end. (Those in `ts` may differ from them by rounding.)
     saved_steps = np.asarray(problem.levels.saved_steps[0])
     saved_times = float(problem.t0) + saved_steps * float(problem.levels.h[0])
     return Ensemble(
@@ -233,14 +233,14 @@ def _default_batch_size(engine: str, problem: Problem) -> int:
 def _simulated_batches(
     problem: Problem, key: PRNGKeyArray, engine: str, num_paths: int, batch_size: int
 ) -> list[Batch]:
-    """The batches that hold this number of paths, and maybe surplus ones at the end."""
+    """The batches that hold this number of paths, and for `"jax"` maybe surplus ones at the
+    end."""
     simulate_batch = ENGINES[engine]
     batches = []
     for first in range(0, num_paths, batch_size):
-        # JAX compiles for one batch size, so the last batch has it, too.
-        size = batch_size
-        if engine != "jax":
-            size = min(batch_size, num_paths - first)
+        # JAX would compile anew for a last batch of another size.
+        num_left = num_paths - first
+        size = batch_size if engine == "jax" else min(batch_size, num_left)
         sample_numbers = np.arange(first, first + size, dtype=np.uint64)
         batches.append(simulate_batch(problem, key, sample_numbers))
     return batches

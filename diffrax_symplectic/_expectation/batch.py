@@ -36,7 +36,7 @@ class BatchMoments(NamedTuple):
     - `any_failed`: whether any path failed, counted or not.
     - `mean`: the mean of the good samples.
     - `mean_correction`: what rounding took from this mean. It is added in float64.
-    - `norm`: the root of the sum of squared deviations from the exact mean.
+    - `norm`: the root of the sum of squared deviations from the mean after its correction.
     - `largest`: the largest deviation.
     - `size`: the largest absolute value.
     """
@@ -62,8 +62,8 @@ def _moments_on_devices(
     samples_per_device: int,
 ) -> BatchMoments:
     """The moments on all devices, along a leading axis. The first device begins with the
-    sample number whose low and high 32 bits are in `low_high`. Only the first `num_wanted`
-    samples of all devices together count."""
+    sample number whose low 32 bits are `low_high[0]`, and the high ones `low_high[1]`. Only
+    the first `num_wanted` samples of all devices together count."""
     moments_on_device = ft.partial(
         _moments_on_device,
         key_data=key_data,
@@ -156,12 +156,12 @@ def _moments_on_device(
 def _high_and_low_of_sum(
     low_high: UInt32[Array, "2"], index: Int[Array, " n"]
 ) -> tuple[UInt32[Array, " n"], UInt32[Array, " n"]]:
-    """The high and the low 32 bits of a sum: a number, whose low and high bits are in
-    `low_high`, plus an index. (There may be no 64-bit integers.)"""
+    """The high and the low 32 bits of the sum of a number and each `index`. The low bits of
+    the number come first in `low_high`. (JAX may have no 64-bit integers.)"""
     first_low = low_high[0]
     first_high = low_high[1]
     low = first_low + index.astype(jnp.uint32)
-    # The sum wrapped around.
+    # The sum has wrapped around if it is less than one of its terms.
     has_carry = low < first_low
     high = first_high + has_carry.astype(jnp.uint32)
     return high, low
@@ -180,20 +180,21 @@ def _moments_of_fields(
 
     x = jnp.where(is_used, x, 0)
     size = largest_of_samples(x)
-    to_unit, from_unit = _scales(size)
-    mean = from_unit * (jnp.sum(x * to_unit[:, :, None], axis=2) / divisor)
-    # Two passes avoid cancellation. The second also finds the rounding error of the mean.
+    to_unit, to_size = _scales(size)
+    mean = to_size * (jnp.sum(x * to_unit[:, :, None], axis=2) / divisor)
+    # Deviations in a second pass avoid cancellation. Their own mean, which would be zero
+    # without rounding, is the correction of the mean.
     deviations = jnp.where(is_used, x - mean[:, :, None], 0)
     largest = largest_of_samples(deviations)
-    to_unit, from_unit = _scales(largest)
-    scaled = deviations * to_unit[:, :, None]
+    deviations_to_unit, to_deviations = _scales(largest)
+    scaled = deviations * deviations_to_unit[:, :, None]
     scaled_correction = jnp.sum(scaled, axis=2) / divisor
     # The sum of squared deviations from the corrected mean.
     scaled_squares = jnp.sum(scaled**2, axis=2) - divisor * scaled_correction**2
     return dict(
         mean=mean,
-        mean_correction=from_unit * scaled_correction,
-        norm=from_unit * jnp.sqrt(jnp.maximum(scaled_squares, 0)),
+        mean_correction=to_deviations * scaled_correction,
+        norm=to_deviations * jnp.sqrt(jnp.maximum(scaled_squares, 0)),
         largest=largest,
         size=size,
     )

@@ -26,15 +26,16 @@ _TRIAL_KEY = 0xFFFFFFFF
 # Paths are sorted in up to this many dimensions: the default of 2^14 paths leaves eleven
 # along each of four coordinates.
 _MOST_COMPONENTS_SORTED = 4
-# Where a fit leaves more than this of the standard error, paths are sorted instead. For an
-# indicator and a call option on the pendulum fits left 26% and 1.3%, and sorted paths had
-# error bars that were 23 and 8 times less.
+# Where a fit leaves more than this fraction of the standard error, paths are sorted
+# instead. For an indicator and a call option on the pendulum fits left 26% and 1.3%, and
+# sorted paths had error bars that were 23 and 8 times less.
 _MOST_REMAINDER = 0.01
-# Without a tolerance, value functions take this part of their paths if the error of the
-# steps is far larger. (Fewer may miss rare paths.)
-_PART_BESIDE_STEPS = 4
-# The number of independent paths without a tolerance. (The other samplings have defaults.)
-_PATHS = 2**17
+# Without a tolerance, an estimate by value functions ends after this fraction of its paths
+# if the error of the steps is far larger than that of sampling. (Fewer may miss rare
+# paths.)
+_FRACTION_BESIDE_STEPS = 1 / 4
+# The most independent paths without a tolerance. (The other samplings have defaults.)
+_MOST_INDEPENDENT_PATHS = 2**17
 # With a tolerance, which ends the estimate, the number of samples is without limit.
 _MOST_SAMPLES = 10**9
 # Without a tolerance, paths take no more than about this many seconds on two cores, since
@@ -43,12 +44,12 @@ _SECONDS_OF_PATHS = 1.5
 # Sorted paths are drawn and sorted before each step, which takes as long as this many
 # operations for each path.
 _OPERATIONS_OF_SORTING = 1500
-# The fewest paths, and paths of each replicate, however long they take: fewer do not know
-# their own spread.
+# The fewest independent paths, and sorted paths of each replicate, however long they take:
+# the standard deviation of fewer is too uncertain.
 _FEWEST_PATHS = 2**8
 _FEWEST_PATHS_OF_REPLICATE = 2**7
-# The sizes of a trial, a part of those of an estimate: it looks for changes that are
-# several times the error of both.
+# The sizes of a trial, which are smaller than those of an estimate: it only looks for
+# changes that are several times the errors of both.
 _REPLICATES_OF_TRIAL = 8
 _PATHS_OF_SORTED_TRIAL = 2**12
 _PATHS_OF_TRIAL = 2**14
@@ -103,7 +104,7 @@ def choose(problem_for: Callable[[Want], Problem], request: Request) -> Decision
     else:
         plan = sampling.prepare(problem, trial_key(key), devices)
 
-    # Of the plans only one by value functions has a remainder.
+    # The remainder is zero except for value functions.
     if is_open and plan.remainder > _MOST_REMAINDER:
         sorted_sampling = array_rqmc_for(problem, tol)
         if sorted_sampling is not None:
@@ -125,8 +126,9 @@ def choose(problem_for: Callable[[Want], Problem], request: Request) -> Decision
         # place of 20, 21, 27, 27 and 26, though paths then take up to 1.3 times as long.
         plan = plan._replace(is_quick=True)
     if is_open and isinstance(sampling, ValueFunctions):
-        # The path of a fit takes far longer than another.
-        least = plan.num_samples // _PART_BESIDE_STEPS
+        # A path with a control variate takes far longer than another, so none is taken in
+        # vain.
+        least = int(plan.num_samples * _FRACTION_BESIDE_STEPS)
         plan = plan._replace(least_beside_steps=least)
     if start is not None and tol is None and plan.num_samples == _MOST_SAMPLES:
         # `start` had a tolerance, and this call has none: it takes no further samples.
@@ -203,10 +205,9 @@ def _independent_sampling(problem: Problem, tol: float | None) -> IndependentPat
     """As many independent paths as there is time for, or with `tol` as many as it takes."""
     if tol:
         return IndependentPaths(_MOST_SAMPLES)
-    # The operations of each step, for one more path.
-    operations = operations_per_step(problem)
-    num_affordable = _affordable_operations(problem) / operations
-    return IndependentPaths(int(np.clip(num_affordable, _FEWEST_PATHS, _PATHS)))
+    num_affordable = _affordable_operations(problem) / operations_per_step(problem)
+    num_paths = np.clip(num_affordable, _FEWEST_PATHS, _MOST_INDEPENDENT_PATHS)
+    return IndependentPaths(int(num_paths))
 
 
 def array_rqmc_for(problem: Problem, tol: float | None) -> ArrayRQMC | None:
@@ -215,17 +216,18 @@ def array_rqmc_for(problem: Problem, tol: float | None) -> ArrayRQMC | None:
     if not _suits_sorting(problem):
         return None
     default = ArrayRQMC()
-    # The operations of each step, for one more path.
+    # In each step, for one path.
     operations = operations_per_step(problem) + _OPERATIONS_OF_SORTING
+    # Paths of all replicates together.
     num_affordable = np.clip(
         int(_affordable_operations(problem) / operations),
         default.replicates * _FEWEST_PATHS_OF_REPLICATE,
         default.replicates * default.num_paths,
     )
-    # Sobol' points need a power of two: the largest for so many replicates. What is left is
-    # time for more of them.
-    of_replicate = int(num_affordable) // default.replicates
-    num_paths = 2 ** (of_replicate.bit_length() - 1)
+    # Sobol' points need a power of two: the largest that allows as many replicates as by
+    # default. The paths that this leaves are spent on further replicates.
+    most_of_replicate = int(num_affordable) // default.replicates
+    num_paths = 2 ** (most_of_replicate.bit_length() - 1)
     replicates = int(num_affordable) // num_paths
     return ArrayRQMC(num_paths, _MOST_SAMPLES if tol else replicates)
 

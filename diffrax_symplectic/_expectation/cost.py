@@ -16,24 +16,25 @@ from .._simulation import Problem
 from .._solver import without_newton
 
 
-# The sums that two cores compute in a second in large batches of paths. This constant, the
-# passes through a loop, and the costs of complex numbers and of a sine are a fit to the
-# processor time of 26 systems and solvers, from the pendulum to a Schroedinger lattice and
-# Brownian paths of a user's own: seconds predicted are 0.4 to 2.5 times those measured.
-# Not where sweeps converge slowly: two damped spins take 5 times as long as predicted at
-# h = 0.2, and 10 times at h = 0.5.
+# All costs here are in units of a sum of two real numbers. This is how many of them two
+# cores compute in a second in large batches of paths. This constant, the passes through a
+# loop, and the costs of complex numbers and of a sine are a fit to the processor time of 26
+# systems and solvers, from the pendulum to a Schroedinger lattice and Brownian paths of a
+# user's own: seconds predicted are 0.4 to 2.5 times those measured. They are too few where
+# sweeps converge slowly: two damped spins take 5 times as long as predicted at h = 0.2, and
+# 10 times at h = 0.5.
 OPERATIONS_PER_SECOND = 6e10
-# The passes through a loop of unknown length with no other such loop inside of it: sweeps
+# How often a loop of unknown length runs, if no other such loop is inside of it: sweeps
 # over the equations of a step until the last path of a batch has converged, or the levels
 # of a `diffrax.VirtualBrownianTree`.
 _PASSES = 12
-# As many real numbers take as long as a complex one.
-_OF_COMPLEX = 7
+# An operation on complex numbers takes this many times as long as on real ones.
+_COMPLEX_PER_REAL = 7
 # Operations on matrices are calls of LAPACK, which take some 100 ns each.
-_OF_LAPACK = 6_000
-# The operations that are not a sum, by the number of sums that take as long as one of their
-# results. Except for sines and their like, which the compiler partly merges, they were
-# timed by themselves. Operations that only move numbers are free.
+_COST_OF_LAPACK = 6_000
+# The cost for each number in the result of an operation; those not listed cost 1. Except
+# for sines and their like, which the compiler partly merges, they were timed by themselves.
+# Operations that only move numbers are free.
 _NAMES_BY_COST = {
     0: "bitcast_convert_type broadcast_in_dim complex convert_element_type copy imag "
     "random_unwrap random_wrap real reshape squeeze transpose",
@@ -50,20 +51,20 @@ _COST_BY_NAME = {
     name: cost for cost, names in _NAMES_BY_COST.items() for name in names.split()
 }
 # Reductions read their arguments from memory: the cost for each number that they read.
-_OF_REDUCTION = 10
+_COST_OF_REDUCTION = 10
 # The cost for each number that is added by its index, as in the derivative of `q[i]`.
-_OF_SCATTER = 80
-# What a product of matrices or vectors takes besides its sums and products, for real and
+_COST_OF_SCATTER = 80
+# What a product of matrices or vectors costs besides its sums and products, for real and
 # for complex numbers.
-_OF_CALL = 300
-_OF_COMPLEX_CALL = 4_000
+_COST_OF_PRODUCT = 300
+_COST_OF_COMPLEX_PRODUCT = 4_000
 
 
 @once_for_each_signature
 def operations_per_step(problem: Problem) -> int:
     """How many operations on single numbers a step of one path takes, as a measure of its
     cost. An operation that takes longer than a sum counts as several."""
-    # Newton's method, which rescues paths whose sweeps fail, is rarely used.
+    # Newton's method is in the program of a step, but rarely runs: only where sweeps fail.
     lean = dataclasses.replace(problem, solver=without_newton(problem.solver))
     traced, _, _ = eqx.filter_make_jaxpr(_first_step)(lean, problem.y0)
     return max(1, _count_operations(traced.jaxpr))
@@ -80,8 +81,8 @@ def _first_step(problem: Problem, y: Y) -> tuple[Y, Float[Array, ""]]:
 
 def _count_operations(jaxpr: Jaxpr) -> int:
     """The number of operations in a program, with the programs inside it."""
-    # What no result needs is not computed: a sweep over the momenta evaluates the force,
-    # although the program contains the velocity, too.
+    # The compiler leaves out what no result needs. For example, the program of a sweep over
+    # the momenta contains the velocity, which only a sweep over the positions would use.
     jaxpr, _ = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
     return sum(map(_operations_of, jaxpr.eqns))
 
@@ -95,35 +96,37 @@ def _operations_of(eqn: Any) -> int:
         count = sum(map(_count_operations, inner_programs))
         return _passes(eqn) * count
     if name in LAPACK:
-        return _OF_LAPACK
+        return _COST_OF_LAPACK
     if name.startswith("reduce_"):
-        return _OF_REDUCTION * sum(map(_size, eqn.invars))
+        return _COST_OF_REDUCTION * sum(map(_size, eqn.invars))
     if name.startswith("scatter"):
-        return _OF_SCATTER * _size(eqn.invars[-1])
+        return _COST_OF_SCATTER * _size(eqn.invars[-1])
     size = sum(map(_size, eqn.outvars))
     is_complex = any(map(_is_complex, eqn.outvars))
     if name == "dot_general":
         return _operations_of_product(eqn, size, is_complex)
     cost = _COST_BY_NAME.get(name, 1)
-    return cost * size * (_OF_COMPLEX if is_complex else 1)
+    return cost * size * (_COMPLEX_PER_REAL if is_complex else 1)
 
 
 def _operations_of_product(eqn: Any, size: int, is_complex: bool) -> int:
-    """`_operations_of` a product of matrices or vectors with so many entries."""
+    """`_operations_of` a product of matrices or vectors whose result has `size` entries,
+    each of them a sum over the contracted axes."""
     (contracted_axes, _), _ = eqn.params["dimension_numbers"]
-    factor, _ = eqn.invars
-    shape = factor.aval.shape
+    first_factor, _ = eqn.invars
+    shape = first_factor.aval.shape
     num_products = size * math.prod(shape[axis] for axis in contracted_axes)
     if is_complex:
-        return _OF_COMPLEX_CALL + _OF_COMPLEX * num_products
-    return _OF_CALL + num_products
+        return _COST_OF_COMPLEX_PRODUCT + _COMPLEX_PER_REAL * num_products
+    return _COST_OF_PRODUCT + num_products
 
 
 def _passes(eqn: Any) -> int:
     """How often the programs in an operation run."""
     if eqn.primitive.name == "scan":
         return eqn.params["length"]
-    # Loops around others check whether these are done, which is mostly so.
+    # A loop around another one runs it again only if it has not finished, which is rare, so
+    # it counts as one pass.
     if eqn.primitive.name == "while" and not any(map(_has_loop, programs_in(eqn))):
         return _PASSES
     return 1

@@ -53,15 +53,16 @@ from .sampling import AbstractSampling
 from .strong_friction import unresolved_friction
 
 
-# The levels, unless the user chooses them: the fewest that tell the discretization error,
-# and with `tol` at most so many, the last of which has steps of `dt0 / 32`.
+# The number of levels, unless the user chooses it: the fewest that show the discretization
+# error, and with `tol` up to `_MOST_LEVELS`, the last of which has steps of `dt0 / 32`.
 _FEWEST_LEVELS = 2
 _MOST_LEVELS = 6
-# Without fits, levels and checks of the steps there is one program.
+# The advice for a quick first look. With these arguments only one program is compiled, as
+# there are no fits, no further levels and no checks of the steps.
 _QUICK_LOOK = "few paths on one level, `sampling=IndependentPaths(1000), levels=1`"
 # Two means count as different if they are this many standard errors apart: by chance that
 # happens once in sixteen thousand times.
-_SURE_OF_LAW = 4
+_STD_ERRORS_TO_BE_SURE = 4
 
 
 def expectation(
@@ -276,26 +277,26 @@ def messages_on_steps(problem: Problem, dt0: float) -> list[str]:
     # With one level the result does not claim to include the discretization error.
     if levels == 1:
         return []
-    told = [
+    found = [
         jumps_within_steps(problem) or unresolved_drive(problem),
         too_long_steps(problem, dt0),
     ]
     # With three levels the order is checked, which shows the following.
     if levels == 2:
-        told += [
+        found += [
             unresolved_noise(problem, dt0),
             unresolved_friction(problem, dt0),
             jumps_at_step_ends(problem),
         ]
-    return [message for message in told if message is not None]
+    return [message for message in found if message is not None]
 
 
 def _messages_on_discrete_increments(
     estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: Devices
 ) -> list[str]:
     """What is wrong with the mean of a `phi` that may not be smooth if increments are
-    discrete, as sentences, one at most: by a trial with Gaussian increments, or without a
-    trial if the solver takes no others."""
+    discrete, as a list of one sentence or none. A trial with Gaussian increments shows it,
+    or without a trial, that the solver takes discrete increments only."""
     paths = random_paths(problem.terms)
     laws = [law for path in paths for law in (laws_of(path) or {}).values()]
     if not any(isinstance(law, Discrete) for law in laws):
@@ -308,11 +309,11 @@ def _messages_on_discrete_increments(
         ]
     trial = _trial_with_gaussian_increments(problem, key, devices)
 
-    own = estimate.vectors
-    other = trial.vectors
-    changes = np.abs(own.mean - other.mean)
-    errors = np.hypot(own.std_error, other.std_error)
-    if not np.any(changes > _SURE_OF_LAW * errors):
+    of_estimate = estimate.vectors
+    of_trial = trial.vectors
+    changes = np.abs(of_estimate.mean - of_trial.mean)
+    std_errors = np.hypot(of_estimate.std_error, of_trial.std_error)
+    if not np.any(changes > _STD_ERRORS_TO_BE_SURE * std_errors):
         return []
     return [
         "`phi` is not smooth, and its mean changes by up to "
@@ -344,10 +345,10 @@ def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
     precision = np.finfo(problem.dtype)
     if precision.bits >= 64:
         return
-    # Step sizes are rounded along with times, so errors of the same sign add up over steps.
+    # The rounding errors of a step size have the same sign in all steps, so they add up.
     fraction = float(precision.eps) * problem.finest_steps
-    # Estimates report at least this (see `rounding_floor`). Within twice this floor,
-    # rounding may be most of the standard error.
+    # No estimate reports a standard error below this (see `rounding_floor`). Up to twice
+    # the floor, rounding may be most of it.
     floor = fraction * np.abs(estimate.vectors.mean)
     if np.any(estimate.vectors.std_error <= 2 * floor):
         warnings.warn(

@@ -24,8 +24,8 @@ from .._terms import (
 from .linear_maps import arbitrary_direction
 
 
-# Multiples of this number, without their whole parts, fill an interval evenly, and no
-# period repeats in step with them.
+# The fractional parts of its multiples fill the interval from 0 to 1 evenly, and fall into
+# step with no period.
 _GOLDEN_RATIO = (1 + 5**0.5) / 2
 
 # A vector field at a time and a state. (A `jax.tree_util.Partial`, so that the terms in it
@@ -55,7 +55,8 @@ def noise_field(noise: Terms, args: Args) -> Field:
 
 
 def depends_on_time(field: Field, problem: Problem, y0: Y) -> bool:
-    """Whether a field reads the time, by its dependence, not by its values."""
+    """Whether a field depends on time: whether its program reads the time. (Its values at
+    several times might be equal by chance.)"""
     return _depends_on_time(field, jnp.asarray(problem.t0), y0)
 
 
@@ -66,8 +67,9 @@ def _depends_on_time(field: Field, t0: Array, y0: Y) -> bool:
 
 
 def at_both_states(field: Field, y0: Y) -> Callable[[Array], Float[Array, " n"]]:
-    """The field at a time, at `y0` and at an arbitrary state, as one vector: at `y0` a
-    force that jumps may vanish, as in a trap that is stiffened while a particle rests."""
+    """The function from a time to the field at two states, as one vector: at `y0`, and at
+    an arbitrary state. (At `y0` alone a change may not show: in a trap that is stiffened,
+    the force on a particle at its centre is always zero.)"""
     y0_and_moved = jtu.tree_map(lambda *leaves: jnp.stack(leaves), y0, _moved(y0))
 
     def at_both(t: Array) -> Float[Array, " n"]:
@@ -77,7 +79,7 @@ def at_both_states(field: Field, y0: Y) -> Callable[[Array], Float[Array, " n"]]
 
 
 def spread_evenly(number: int) -> Float[np.ndarray, " number"]:
-    """So many times from 0 to 1, in units of an interval, the first of which is 0."""
+    """So many points from 0 to 1, the first of which is 0. They are not in order."""
     return np.arange(number) * _GOLDEN_RATIO % 1
 
 
@@ -108,7 +110,7 @@ def _all_fields(
 
 
 def _moved(y0: Y) -> Y:
-    """An arbitrary state, about as large as `y0`."""
+    """An arbitrary state, about as far from `y0` as `y0` is from zero."""
 
     def moved_leaf(x: PyTree[Array]) -> Array:
         x = jnp.asarray(x)

@@ -33,22 +33,22 @@ from .run import run
 from .sampling import SamplingPlan
 
 
-# The numbers of paths of a trial on the same noise: more are taken only while their noise
-# hides changes as large as the error.
-_NUMBERS_OF_PATHS = 512, 2048, 8192
-# The largest shares of the samples of an estimate that a trial takes: at first, and if more
-# are needed. A path of a trial has 7 steps for 3 on the same noise, or 2 for 1, so it takes
-# a small part of the time.
-_FIRST_SHARE = 1 / 8
-_LARGEST_SHARE = 1 / 32
-# Fewer paths than this do not know their own spread, and more would take longer than the
-# estimate.
+# The paths of a trial on the same noise: a larger number is tried only if, with the one
+# before, statistical noise hides changes as large as the error.
+_PATHS_OF_TRIALS = 512, 2048, 8192
+# A trial takes at most this share of the samples of the estimate: the first one, and any
+# that follows. Where the estimate takes 3 steps (1 and 2, on two levels), a path of the
+# trial takes 7 on the same noise (1, 2 and 4), or 6 with half the steps on both levels.
+_SHARE_OF_FIRST_TRIAL = 1 / 8
+_SHARE_OF_LATER_TRIALS = 1 / 32
+# The standard error of fewer paths than this is itself too uncertain. An estimate whose
+# share is less than this has no trial, since one of 32 paths would be a large part of it.
 _FEWEST_PATHS = 32
-# A change is sure if it is this many standard errors from zero: by chance that happens once
-# in 370 times for a single mean, and hardly more often for the largest of many.
-_SURE_OF_ONE = 3
-# A trial of which more paths fail than this part has no mean to compare.
-_MOST_FAILED = 0.1
+# The change of a single mean is sure if it is this many standard errors from zero, which
+# happens by chance once in 370 times. (`_Changes.visible` asks for more of many means.)
+_STD_ERRORS_TO_BE_SURE = 3
+# A trial in which more than this share of the paths fails has no mean to compare.
+_LARGEST_SHARE_FAILED = 0.1
 
 
 class Trial(NamedTuple):
@@ -72,14 +72,16 @@ def trial_with_finer_level(
 ) -> Trial:
     """Whether a finer level changes an estimate of two levels by more than its error.
 
-    Two levels are wrong and agree where both miss what happens in shorter times, such as a
-    rotation, a close encounter or a decay, and by chance where phases are lost.
+    Two levels agree on a wrong mean where both miss what happens in shorter times, such as
+    a rotation, a close encounter or a decay, and by chance where phases are lost.
 
-    A trial of independent paths has the same noise on all levels where the solver allows
-    it, so that their differences vary little. That hides changes of a hundred errors of
-    value functions and of sorted paths. These are taken again with half the steps, by the
-    programs that are compiled already, which hides changes of ten errors. (Where steps may
-    miss a rotation, that would not clear sorted paths of the suspicion.)"""
+    There are two kinds of trials. One takes independent paths, with the same noise on all
+    levels if the solver allows it, so that their differences vary little. Even so, the
+    standard error of a difference may be a hundred times the error of an estimate by value
+    functions or sorted paths. So these are sampled again with half the steps, by the
+    programs that are compiled already: a change of ten errors is then visible. (Sorted
+    paths whose steps may miss a rotation get the first kind all the same, since a change of
+    less than ten errors would remain possible.)"""
     if any(map(has_unknown_law, brownian_paths(problem.terms))):
         return Trial()
     key = trial_key(key)
@@ -97,7 +99,8 @@ def trial_with_finer_level(
     if changes.are_sure:
         h = float(problem.levels.h[-1]) / 2
         return Trial(message=_message(estimate, changes, h))
-    # The noise of fewer samples is always larger, which says little of resolved steps.
+    # The same sampling with fewer samples always has the larger standard error. That it
+    # hides changes is then no sign that something is wrong.
     if is_fitted or has_same_sampling or not changes.are_hidden:
         return Trial()
     if angle is None:
@@ -108,26 +111,29 @@ def trial_with_finer_level(
 class _Changes(NamedTuple):
     """The changes of all means by a finer level.
 
-    - `sizes`, `noise`: their sizes and standard errors.
-    - `errors`: the errors of the means.
+    - `sizes`, `std_errors`: their absolute values and standard errors.
+    - `errors`: the errors of the means, as the estimate states them.
     - `num_paths`: the number of paths of the trial.
     """
 
     sizes: Float[np.ndarray, " n"]
-    noise: Float[np.ndarray, " n"]
+    std_errors: Float[np.ndarray, " n"]
     errors: Float[np.ndarray, " n"]
     num_paths: int
 
     @property
     def visible(self) -> Float[np.ndarray, " n"]:
-        """The smallest changes that are surely no noise."""
-        sure = np.sqrt(_SURE_OF_ONE**2 + 2 * np.log(self.sizes.size))
-        return sure * self.noise
+        """The smallest changes that are surely not by chance."""
+        # The largest of n normal numbers grows like the square root of 2 log(n).
+        num_std_errors = np.sqrt(
+            _STD_ERRORS_TO_BE_SURE**2 + 2 * np.log(self.sizes.size)
+        )
+        return num_std_errors * self.std_errors
 
     @property
     def excess(self) -> Float[np.ndarray, " n"]:
-        """By how much the changes surely exceed the errors."""
-        # What is not finite is larger than nothing.
+        """By how much the changes surely exceed the errors; negative if they do not."""
+        # A change that is NaN must not be the largest, for `np.any` and `np.argmax`.
         return np.nan_to_num(self.sizes - self.visible - self.errors, nan=-np.inf)
 
     @property
@@ -146,9 +152,9 @@ def _message(estimate: Expectation, changes: _Changes, h: float) -> str:
     return (
         f"Steps are too long: on {changes.num_paths} paths of a trial, a third level, with "
         f"steps of {h:.3g}, changes a mean{label_of(estimate, worst)} by "
-        f"{changes.sizes[worst]:.2g} ± {changes.noise[worst]:.1g}, which is more than its "
-        f"error, {changes.errors[worst]:.1g}. Pass a smaller `dt0`, or `levels=3`, which "
-        "checks the order."
+        f"{changes.sizes[worst]:.2g} ± {changes.std_errors[worst]:.1g}, which is more "
+        f"than its error, {changes.errors[worst]:.1g}. Pass a smaller `dt0`, or "
+        "`levels=3`, which checks the order."
     )
 
 
@@ -175,8 +181,9 @@ def _caveat(estimate: Expectation, changes: _Changes) -> str:
 def _changes_on_same_noise(
     estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: Devices
 ) -> _Changes | None:
-    """The changes on independent paths, as many as they take; `None` if too few are
-    affordable, or too many fail."""
+    """The changes on independent paths, more and more of them until the changes are sure,
+    or known well enough to be less than the errors. `None` if the estimate has too few
+    paths for a trial, or too many paths of the trial fail."""
     finer_problem = _with_finer_level(problem, key)
     trial = None
     changes = None
@@ -184,12 +191,13 @@ def _changes_on_same_noise(
         sampling = IndependentPaths(num_paths, _batch_size(estimate))
         plan = sampling.prepare(finer_problem, key, devices)
         trial = run(plan._replace(is_quick=True), key, devices, start=trial)
-        if trial.num_failed > _MOST_FAILED * num_paths:
+        if trial.num_failed > _LARGEST_SHARE_FAILED * num_paths:
             return None
+        # The single combination of levels of `finer_problem` is the change.
         change = combined_results(trial, Combination.BEST)
         changes = _Changes(
             sizes=np.abs(change.mean),
-            noise=change.std_error,
+            std_errors=change.std_error,
             errors=estimate.vectors.error,
             num_paths=num_paths,
         )
@@ -206,22 +214,25 @@ def _changes_by_same_sampling(
     assert plan.with_half_steps is not None
     # At least two samples, for a standard error; and a whole batch, since a part of one
     # takes as long.
-    num_samples = max(2, plan.batch_size, int(_FIRST_SHARE * estimate.num_samples))
+    num_samples = max(
+        2, plan.batch_size, int(_SHARE_OF_FIRST_TRIAL * estimate.num_samples)
+    )
     trial_plan = plan.with_half_steps()._replace(
         num_samples=num_samples, is_quick=plan.is_quick
     )
     trial = run(trial_plan, key, devices)
-    if trial.num_failed > _MOST_FAILED * num_samples * plan.paths_per_sample:
+    if trial.num_failed > _LARGEST_SHARE_FAILED * num_samples * plan.paths_per_sample:
         return None
-    own = estimate.vectors
-    other = trial.vectors
-    # So few samples may show a standard error that is far too small. It is taken to be at
-    # least that of the estimate, scaled to their number.
-    expected = own.std_error * np.sqrt(estimate.num_samples / num_samples)
+    of_estimate = estimate.vectors
+    of_trial = trial.vectors
+    # The standard error of so few samples may come out far too small. It is taken to be at
+    # least what the spread of the estimate's samples gives for this number of them.
+    least = of_estimate.std_error * np.sqrt(estimate.num_samples / num_samples)
+    trial_std_error = np.maximum(least, of_trial.std_error)
     return _Changes(
-        sizes=np.abs(other.mean - own.mean),
-        noise=np.hypot(own.std_error, np.maximum(expected, other.std_error)),
-        errors=own.error,
+        sizes=np.abs(of_trial.mean - of_estimate.mean),
+        std_errors=np.hypot(of_estimate.std_error, trial_std_error),
+        errors=of_estimate.error,
         num_paths=trial.num_paths,
     )
 
@@ -230,19 +241,19 @@ def _trial_sizes(estimate: Expectation) -> list[int]:
     """The numbers of paths to try in turn; none if even the first would be too small."""
     # A fit takes far longer than the largest trial.
     if isinstance(estimate.sampling, ValueFunctions):
-        return list(_NUMBERS_OF_PATHS)
-    first, *others = _NUMBERS_OF_PATHS
-    first = min(first, int(_FIRST_SHARE * estimate.num_paths))
+        return list(_PATHS_OF_TRIALS)
+    first, *others = _PATHS_OF_TRIALS
+    first = min(first, int(_SHARE_OF_FIRST_TRIAL * estimate.num_paths))
     if first < _FEWEST_PATHS:
         return []
-    most = _LARGEST_SHARE * estimate.num_paths
-    return [first] + [number for number in others if number <= most]
+    most = _SHARE_OF_LATER_TRIALS * estimate.num_paths
+    return [first] + [num_paths for num_paths in others if num_paths <= most]
 
 
 def _batch_size(estimate: Expectation) -> int:
-    """The paths that a trial takes at once: those of its first number, or as few as the
-    user chooses where paths take much memory."""
-    largest = _NUMBERS_OF_PATHS[0]
+    """The paths that trials take at once: as many as the first trial has, so that all share
+    a program, or fewer if the user chose a smaller batch, as to save memory."""
+    largest = _PATHS_OF_TRIALS[0]
     sampling = estimate.sampling
     if isinstance(sampling, IndependentPaths) and sampling.batch_size is not None:
         return min(largest, int(sampling.batch_size))
@@ -250,14 +261,15 @@ def _batch_size(estimate: Expectation) -> int:
 
 
 def _with_finer_level(problem: Problem, key: PRNGKeyArray) -> Problem:
-    """The problem with one more level, whose single combination of levels is the change
-    of the estimate by it."""
+    """The problem with one more level. Its single combination of levels is the change of
+    the mean if the coarsest level is left out for the new one."""
     levels = with_next_level(problem.levels)
     finest = levels.h[-1]
     terms = problem.terms
-    # All levels have the same noise by paths that are sampled over cells of the finest
-    # step, if these begin at multiples of it, and the solver takes Gaussian increments.
-    # Otherwise the levels have independent noise.
+    # Paths that draw an increment for each cell, one finest step long, have the same noise
+    # on all levels. Cells begin at multiples of their length, where steps must begin, too,
+    # and their increments are Gaussian, which the solver must take. Otherwise the levels
+    # have independent noise.
     begins_at_cell = is_multiple(float(problem.t0), float(finest))
     if begins_at_cell and not has_discrete_increments(problem.solver):
         # An array, so that another cell compiles nothing anew.

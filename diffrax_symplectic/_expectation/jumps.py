@@ -38,17 +38,18 @@ from .fields_in_time import (
 # How far on either side of the end of a step forces are compared, in units in the last
 # place of the largest time: the user's time of a jump and that of a step are rounded.
 _ROUNDINGS = 16
-# The part of a step over which the change of a smooth force is measured.
-_SMOOTH_PART = 1e-3
-# A jump is larger than so many times this change.
-_JUMP = 4
+# The fraction of a step over which the change of a smooth force is measured.
+_SMOOTH_FRACTION = 1e-3
+# A change that is more than so many times this one is a jump.
+_JUMP_PER_SMOOTH_CHANGE = 4
 # The most steps that are looked at, the first ones, and how many at once.
 _MOST_STEPS = 2**14
 _STEPS_AT_ONCE = 256
-# In this many steps, those with the largest changes, a jump is searched for, by bisection
-# of the part that changes most. Over a whole step the field may change more than it jumps.
-_MOST_SEARCHED = 256
-_PARTS = 32
+# A jump is searched for in this many steps at most, those with the largest changes. Over a
+# whole step a smooth change may be larger than the jump, so the step is divided into this
+# many parts first, and only the part that changes most is bisected.
+_MOST_STEPS_SEARCHED = 256
+_PARTS_OF_STEP = 32
 
 
 class _Sides(NamedTuple):
@@ -65,19 +66,20 @@ class _Sides(NamedTuple):
 
     @property
     def largest_smooth_change(self) -> Float[Array, ""]:
-        """The largest change from before to after that is no jump: several times that on
-        either side, and by rounding."""
-        before = jnp.linalg.norm(self.before - self.far_before)
-        after = jnp.linalg.norm(self.far_after - self.after)
+        """The largest change from `before` to `after` that does not count as a jump:
+        several times the changes on both sides, plus an allowance for rounding."""
+        change_before = jnp.linalg.norm(self.before - self.far_before)
+        change_after = jnp.linalg.norm(self.far_after - self.after)
         size = jnp.linalg.norm(jnp.stack(self))
-        return _JUMP * (before + after) + jnp.sqrt(jnp.finfo(size.dtype).eps) * size
+        rounding = jnp.sqrt(jnp.finfo(size.dtype).eps) * size
+        return _JUMP_PER_SMOOTH_CHANGE * (change_before + change_after) + rounding
 
 
 class _Steps(NamedTuple):
     """The shortest steps of a problem, as many as are looked at.
 
     - `starts`, `h`: when they start, and how long they are.
-    - `near`, `far`: the distances of `_Sides`.
+    - `near`, `far`: how far before and after a time the fields of `_Sides` are taken.
     """
 
     starts: Float[np.ndarray, " steps"]
@@ -91,21 +93,23 @@ def jumps_within_steps(problem: Problem) -> str | None:
     steps, as a sentence; `None` if none do.
 
     Any solver then makes an error of first order. As long as all levels take the jump at
-    the same end of a step, this error is the same on all of them. Jumps at a random time of
-    each path are not meant: the mean over this time makes the error small."""
+    the same end of a step, this error is the same on all of them, so that they agree. A
+    jump whose time is random, with another one for each path, does not count: the errors
+    of the paths average out."""
     field = all_fields(problem, problem.args)
     if not depends_on_time(field, problem, problem.y0):
         return None
-    steps = _steps_of(problem)
+    steps = _steps_to_look_at(problem)
     if steps is None:
         return None
     times = _times_of_jumps(field, problem, steps)
-    # A jump that another draw of `args` does not have is at a random time of each path.
+    # Only jumps that another draw of `args` has, too, are at the same time on all paths.
     if problem.args_of is not None and times.size:
         other_args = problem.with_args(problem.draw_start(jr.key(2)).args).args
         other_field = all_fields(problem, other_args)
-        others = _times_of_jumps(other_field, problem, steps)
-        are_equal = np.abs(times[:, None] - others) < steps.far
+        other_times = _times_of_jumps(other_field, problem, steps)
+        # (jumps of one draw, jumps of the other)
+        are_equal = np.abs(times[:, None] - other_times) < steps.far
         is_in_both = np.any(are_equal, axis=1)
         times = times[is_in_both]
     if not times.size:
@@ -119,12 +123,14 @@ def jumps_within_steps(problem: Problem) -> str | None:
 
 def jumps_at_step_ends(problem: Problem) -> str | None:
     """What is wrong with forces or noise that jump at the end of a step, as a sentence;
-    `None` if none do, or for solvers that do not take them there, or are of order 1 anyway,
-    by which two levels extrapolate.
+    `None` if none do, or for solvers that do not evaluate them there, or are of order 1
+    anyway, by which two levels extrapolate.
 
-    The steps before and after the jump both take the same side of it, so they are of order
-    1. Two levels extrapolate by order 2, and differ by less than the error. Looks at the
-    ends of the shortest steps, so also at the middles of the longest ones."""
+    Such a field has one value at the time of the jump, which the step that ends there and
+    the one that begins there both take: for one of them it is that of the wrong side. So
+    the mean converges with order 1. But two levels extrapolate by order 2, and find less
+    than the error. The ends of the shortest steps include the middles of steps twice as
+    long."""
     solver = problem.solver
     if isinstance(solver, AbstractLangevinSplitting):
         if not solver.symmetric or not solver.kicks_at_ends:
@@ -167,39 +173,43 @@ def _jumping_stages(
     if solver.weak_order(problem.terms) in (1, None):
         return None
     drift, noise = split_terms(without_constraint(problem.terms))
-    fields_at_ends = []
-    at_ends = [stage for stage in solver.tableau.flatten().stages if stage.c in (0, 1)]
-    for_drift = [stage for stage in at_ends if stage.channels == ("h",)]
+    stages = solver.tableau.flatten().stages
+    stages_at_ends = [stage for stage in stages if stage.c in (0, 1)]
+    # The others evaluate noise.
+    drift_stages = [stage for stage in stages_at_ends if stage.channels == ("h",)]
+    # The fields that are evaluated at ends of steps, by what they would do there.
+    fields = {}
     # Stages that move positions alone evaluate velocities, which do not depend on time.
-    if drift and any(stage.writes != "q" for stage in for_drift):
-        fields_at_ends.append(("forces jump", drift_field(drift, problem.args)))
-    if noise and len(for_drift) < len(at_ends):
-        fields_at_ends.append(("noise jumps", noise_field(noise, problem.args)))
-    ends = [
-        (what, _first_jump_at_end(field, problem, problem.y0))
-        for what, field in fields_at_ends
-    ]
-    jumps = [(what, end) for what, end in ends if end is not None]
+    if drift and any(stage.writes != "q" for stage in drift_stages):
+        fields["forces jump"] = drift_field(drift, problem.args)
+    if noise and len(drift_stages) < len(stages_at_ends):
+        fields["noise jumps"] = noise_field(noise, problem.args)
+    ends = {
+        what_happens: _first_jump_at_end(field, problem, problem.y0)
+        for what_happens, field in fields.items()
+    }
+    jumps = [(what, end) for what, end in ends.items() if end is not None]
     if not jumps:
         return None
-    what, end = jumps[0]
+    what_happens, end = jumps[0]
     return (
-        f"The {what} at step ends, such as t={end:.6g}, and `{type(solver).__name__}` "
-        "takes one side of the jump for both steps: the mean converges to first order "
-        "only, and two levels do not see it. Pass a solver that takes forces and noise "
-        "within steps, such as `ImplicitMidpoint()`."
+        f"The {what_happens} at step ends, such as t={end:.6g}, and "
+        f"`{type(solver).__name__}` takes one side of the jump for both steps: the mean "
+        "converges to first order only, and two levels do not see it. Pass a solver that "
+        "takes forces and noise within steps, such as `ImplicitMidpoint()`."
     )
 
 
-def _steps_of(problem: Problem) -> _Steps | None:
-    """The steps to look at; `None` in single precision long after time zero, if the times
-    around the end of a step may be whole steps away."""
+def _steps_to_look_at(problem: Problem) -> _Steps | None:
+    """The first steps of the finest level; `None` where times are rounded so coarsely, as
+    in single precision long after time zero, that both sides of the end of a step cannot be
+    told from other parts of the step."""
     h = float(problem.levels.h[-1])
-    numbers = np.arange(min(problem.finest_steps, _MOST_STEPS))
-    starts = float(problem.t0) + h * numbers
-    largest = max(abs(float(problem.t0)), abs(starts[-1] + h))
-    near = _ROUNDINGS * float(np.finfo(problem.dtype).eps) * largest
-    far = max(_SMOOTH_PART * h, 4 * near)
+    step_numbers = np.arange(min(problem.finest_steps, _MOST_STEPS))
+    starts = float(problem.t0) + h * step_numbers
+    largest_time = max(abs(float(problem.t0)), abs(starts[-1] + h))
+    near = _ROUNDINGS * float(np.finfo(problem.dtype).eps) * largest_time
+    far = max(_SMOOTH_FRACTION * h, 4 * near)
     if far > h / 8:
         return None
     return _Steps(starts, h, near, far)
@@ -209,36 +219,40 @@ def _times_of_jumps(
     field: Field, problem: Problem, steps: _Steps
 ) -> Float[np.ndarray, " jumps"]:
     """When a field jumps within steps, not at their ends."""
-    # Jumps this near to the end of a step do as little harm as those at it.
-    ends = np.stack(
+    # Jumps that are nearer than this to an end of a step do as little harm as those at it,
+    # so both ends are left out.
+    interiors = np.stack(
         [steps.starts + steps.far, steps.starts + steps.h - steps.far], axis=1
     )
-    ends = ends.astype(problem.dtype)
-    halvings = max(0, int(np.ceil(np.log2(steps.h / _PARTS / steps.near))))
-    distances = np.array([steps.near, steps.far], problem.dtype)
-    times, is_jump = _quick_search(field, problem.y0, ends, halvings, distances)
+    interiors = interiors.astype(problem.dtype)
+    # Bisection goes on until a part of a step is no longer than `near`.
+    halvings = max(0, int(np.ceil(np.log2(steps.h / _PARTS_OF_STEP / steps.near))))
+    near_and_far = np.array([steps.near, steps.far], problem.dtype)
+    times, is_jump = _quick_search(field, problem.y0, interiors, halvings, near_and_far)
     return np.asarray(times)[np.asarray(is_jump)]
 
 
 def _search(
     field: Field,
     y0: Y,
-    ends: Float[Array, "steps 2"],
+    intervals: Float[Array, "steps 2"],
     halvings: int,
     near_and_far: Float[Array, "2"],
 ) -> tuple[Float[Array, " searched"], Bool[Array, " searched"]]:
-    """For the steps between these `ends` in which a field changes most: when it does, and
-    whether this is a jump."""
+    """For the `intervals`, from a start to an end, in which a field changes most: the time
+    at which it changes fastest, and whether it jumps there."""
     at_both = at_both_states(field, y0)
     near, far = near_and_far
 
-    def largest_change(start_and_end: Array) -> Array:
-        start, end = start_and_end
+    def largest_change(interval: Array) -> Array:
+        """The larger of the changes over both halves of an interval."""
+        start, end = interval
         values = jax.vmap(at_both)(jnp.stack([start, (start + end) / 2, end]))
         return jnp.max(jnp.linalg.norm(jnp.diff(values, axis=0), axis=1))
 
-    def jump_in(start_and_end: Array) -> tuple[Array, Bool[Array, ""]]:
+    def jump_in(interval: Array) -> tuple[Array, Bool[Array, ""]]:
         def halve(_, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
+            """The half that changes more of a bracket: two times, and the values there."""
             times, values = bracket
             middle = jnp.mean(times)
             value = at_both(middle)
@@ -248,34 +262,34 @@ def _search(
             second = jnp.array([middle, times[1]]), jnp.stack([value, values[1]])
             return jtu.tree_map(lambda x, y: jnp.where(is_first, x, y), first, second)
 
-        times = jnp.linspace(start_and_end[0], start_and_end[1], _PARTS + 1)
+        times = jnp.linspace(interval[0], interval[1], _PARTS_OF_STEP + 1)
         values = jax.vmap(at_both)(times)
         part = jnp.argmax(jnp.linalg.norm(jnp.diff(values, axis=0), axis=1))
         both_ends = part + jnp.arange(2)
         bracket = times[both_ends], values[both_ends]
-        times, _ = lax.fori_loop(0, halvings, halve, bracket)
-        time = jnp.mean(times)
+        last_times, _ = lax.fori_loop(0, halvings, halve, bracket)
+        time = jnp.mean(last_times)
         around = jnp.array([-far, -near, near, far])
         sides = _Sides(*jax.vmap(at_both)(time + around))
         jump = jnp.linalg.norm(sides.after - sides.before)
         return time, jump > sides.largest_smooth_change
 
-    changes = lax.map(largest_change, ends, batch_size=_STEPS_AT_ONCE)
-    _, largest = lax.top_k(changes, min(_MOST_SEARCHED, len(ends)))
-    return jax.vmap(jump_in)(ends[largest])
+    changes = lax.map(largest_change, intervals, batch_size=_STEPS_AT_ONCE)
+    _, largest = lax.top_k(changes, min(_MOST_STEPS_SEARCHED, len(intervals)))
+    return jax.vmap(jump_in)(intervals[largest])
 
 
 def _first_jump_at_end(field: Field, problem: Problem, y0: Y) -> float | None:
-    """The first end of a step at which a field jumps; `None` if there is none. Paths see
-    one side alone of a jump at `t0`, where no step ends."""
+    """The first end of a step at which a field jumps; `None` if there is none. A jump at
+    `t0` does not count: paths see only the side after it."""
     if not depends_on_time(field, problem, y0):
         return None
-    steps = _steps_of(problem)
+    steps = _steps_to_look_at(problem)
     if steps is None:
         return None
     ends = steps.starts + steps.h
     is_last = np.arange(1, len(ends) + 1) == problem.finest_steps
-    # Those of `_Sides`, and the end itself.
+    # The times of the four fields of `_Sides`, in their order, and the end itself.
     offsets = np.array([-steps.far, -steps.near, steps.near, steps.far, 0])
     times = (ends[:, None] + offsets).astype(problem.dtype)
     jumps = _quick_jumps_at_ends(field, y0, times, is_last)
@@ -287,20 +301,21 @@ def _first_jump_at_end(field: Field, problem: Problem, y0: Y) -> float | None:
 def _jumps_at_ends(
     field: Field, y0: Y, times: Float[Array, "ends 5"], is_last: Bool[Array, " ends"]
 ) -> Bool[Array, " ends"]:
-    """For the end of each step, whether a field jumps there without a mean of both sides.
-    `times` are those of `_Sides` and the end itself."""
+    """For the end of each step, whether a field jumps there, and does not have the mean of
+    both sides as its value, which would be right. `times` are those of the fields of
+    `_Sides` and the end itself."""
     at_both = at_both_states(field, y0)
 
     def jumps_at(end: tuple[Array, Array]) -> Bool[Array, ""]:
         times, is_last = end
-        *sides, there = jax.vmap(at_both)(times)
-        sides = _Sides(*sides)
-        error = jnp.linalg.norm(there - (sides.before + sides.after) / 2)
-        # No step follows the last end, so that the side before it is right, too.
-        error_at_last = jnp.linalg.norm(there - sides.before)
-        error = jnp.where(is_last, jnp.minimum(error, error_at_last), error)
-        # A field with the value of one side is off the mean by half of its jump. (Values
-        # that are not finite are no jumps, since NaN is not larger than anything.)
+        *side_values, value = jax.vmap(at_both)(times)
+        sides = _Sides(*side_values)
+        off_mean = jnp.linalg.norm(value - (sides.before + sides.after) / 2)
+        # No step follows the last end, so the value of the side before is right there, too.
+        off_before = jnp.linalg.norm(value - sides.before)
+        error = jnp.where(is_last, jnp.minimum(off_mean, off_before), off_mean)
+        # A field with the value of one side is off the mean by half of its jump. (With a
+        # NaN among the values, the comparison is false: that is no jump.)
         return 2 * error > sides.largest_smooth_change
 
     return lax.map(jumps_at, (times, is_last), batch_size=_STEPS_AT_ONCE)

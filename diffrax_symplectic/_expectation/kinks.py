@@ -13,8 +13,8 @@ from .._programs import once_for_each_signature
 from .._simulation import Problem
 
 
-# The operations of JAX with kinks or jumps. All others are smooth, except perhaps at single
-# points.
+# The operations of JAX with kinks or jumps. The others are smooth, except perhaps at single
+# points, such as a square root at zero.
 _NOT_SMOOTH = frozenset(
     "abs argmax argmin ceil clamp eq floor ge gt le lt max min ne reduce_max reduce_min "
     "round sign sort top_k".split()
@@ -44,11 +44,11 @@ def _may_be_rough(jaxpr: Jaxpr) -> bool:
     to variables that depend on its inputs."""
     # An operation that no result needs, such as a comparison for a message, is left out.
     jaxpr, _ = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
-    # What the function captures is not among the inputs: it is constant in `y`.
+    # The variables that depend on an input. Arrays that the function captures do not.
     dependent = set(jaxpr.invars)
     for eqn in jaxpr.eqns:
-        variables = [x for x in eqn.invars if not isinstance(x, Literal)]
-        if not any(x in dependent for x in variables):
+        operands = [x for x in eqn.invars if not isinstance(x, Literal)]
+        if not any(x in dependent for x in operands):
             continue
         dependent.update(eqn.outvars)
         if eqn.primitive.name in _NOT_SMOOTH:

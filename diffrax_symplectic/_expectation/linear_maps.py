@@ -1,4 +1,5 @@
-"""What a linear map does most, by power iteration, and directions without symmetries."""
+"""The direction that a linear map enlarges most, by power iteration, and directions without
+symmetries."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,39 +11,39 @@ from jaxtyping import Array, Float
 
 
 class Growth(NamedTuple):
-    """How a linear map enlarges a change, applied to it again and again.
+    """What becomes of a direction `x` to which a linear map `A` is applied repeatedly.
 
-    - `change`: the change, scaled to length one.
-    - `log_growth`: the logarithm of the factor by which it grew each time, in the mean over
-        the times that count.
-    - `along_itself`: the scalar product of the change after the last time with the one
-        before it, of length one: the eigenvalue of largest size, if the map is symmetric.
-        It is negative if the map turned the change around.
+    - `direction`: the direction after the last application, scaled to length one.
+    - `log_growth`: the logarithm of the factor by which one application changes the length,
+        averaged over the second half of them.
+    - `rayleigh_quotient`: `x @ A(x)` for the direction `x` before the last application, of
+        length one. For a symmetric map this is the eigenvalue of largest size. It is
+        negative if the map turns the direction around.
     """
 
-    change: Float[Array, "*times n"]
+    direction: Float[Array, "*times n"]
     log_growth: Float[Array, "*times"]
-    along_itself: Float[Array, "*times"]
+    rayleigh_quotient: Float[Array, "*times"]
 
 
 def largest_growth(
     linear: Callable[[Array], Array], like: Float[Array, " n"], iterations: int
 ) -> Growth:
-    """The growth of the change that a linear map enlarges most, by power iteration: after
-    this many applications of the map, over as many more."""
+    """The growth of the direction that a linear map enlarges most, by power iteration: this
+    many applications of the map find the direction, and as many more measure its growth."""
 
     def after_map(number: Array, before: Growth) -> Growth:
-        change = linear(before.change)
-        # The change before the map has length one, so this is its growth.
-        length = jnp.linalg.norm(change)
+        mapped = linear(before.direction)
+        # Before the map the length is one, so this is the factor by which it grows.
+        length = jnp.linalg.norm(mapped)
         counted_log = jnp.where(number < iterations, 0.0, jnp.log(length))
         log_growth = before.log_growth + counted_log / iterations
-        along_itself = before.change @ change
-        # Without a drift, as between two pulses, nothing is left of a change.
-        scaled = jnp.where(length > 0, change / length, before.change)
-        return Growth(scaled, log_growth, along_itself)
+        rayleigh_quotient = before.direction @ mapped
+        # The map may be zero, as without a drift between two pulses.
+        scaled = jnp.where(length > 0, mapped / length, before.direction)
+        return Growth(scaled, log_growth, rayleigh_quotient)
 
-    # It contains the direction that grows most.
+    # It is a sum of all eigenvectors. The one that grows most outgrows the others.
     direction = arbitrary_direction(like.size, like.dtype)
     zero = jnp.zeros((), like.dtype)
     start = Growth(direction / jnp.linalg.norm(direction), zero, zero)

@@ -42,12 +42,12 @@ from .linear_maps import derivative_at, Growth, largest_growth
 _UNSTABLE = 1.1
 # After this many steps of the tangent flow any change of the state points in the most
 # unstable direction. Its growth is measured over as many more steps.
-_ITERATIONS = 50
+_ITERATIONS_FOR_INSTABILITY = 50
 # The same for the square of the largest frequency, which need not be known as well.
 _ITERATIONS_FOR_FREQUENCY = 15
-# The part of `dt0` that is surely short enough. If such a step fails, too, the length of
-# steps is not the cause.
-_SHORT = 1e-6
+# The fraction of `dt0` that is surely short enough. If such a step fails, too, the length
+# of steps is not the cause.
+_SURELY_SHORT_FRACTION = 1e-6
 # Where noise turns the state by more than this in a step, as a standard deviation, two
 # levels may agree on a wrong mean. Measured for the mean square of the site of an exciton
 # on 3 and 7 sites with noise, by `ImplicitMidpoint`: at 1.4 and below the mean is within
@@ -70,8 +70,9 @@ _TURNS_TOO_FAR_TO_DECAY = 2.0
 # A mode that loses less than this part of its amplitude over the interval has no decay to
 # miss.
 _LEAST_DECAY = 0.01
-# Rates of decay below this part of a frequency may be rounding, in single precision.
-_ROUNDING = 1e-6
+# Rates of decay below this fraction of the largest rate may be rounding errors of it, in
+# single precision.
+_ROUNDING_OF_RATES = 1e-6
 # The largest number of numbers in a state of which all modes are known: the eigenvalues of
 # 256 take 0.1 s.
 _MOST_MODES = 256
@@ -98,11 +99,12 @@ def too_long_steps(problem: Problem, dt0: float) -> str | None:
         return None
     if _is_explicit(problem):
         return _instability(problem, dt0)
-    most = None if solver.record is None else solver.record.most_frequency
+    record = solver.record
+    most_frequency = None if record is None else record.most_frequency
     # Three levels are checked for the order, which shows this.
-    is_checked = len(problem.levels.h) > 2
-    if most is not None and not is_checked:
-        message = _unresolved_frequency(problem, dt0, most)
+    is_order_checked = len(problem.levels.h) > 2
+    if most_frequency is not None and not is_order_checked:
+        message = _unresolved_frequency(problem, dt0, most_frequency)
         if message is not None:
             return message
     return _lost_decay(problem, dt0)
@@ -110,59 +112,71 @@ def too_long_steps(problem: Problem, dt0: float) -> str | None:
 
 def _instability(problem: Problem, dt0: float) -> str | None:
     """`too_long_steps` for an explicit solver."""
-    numbers = _numbers_of_steps(problem)
-    growth = _quick_growth(problem, numbers)
+    step_numbers = _step_numbers_to_look_at(problem)
+    growth = _quick_growth(problem, step_numbers)
     is_unstable = growth.log_growth > np.log(_UNSTABLE)
-    is_unstable &= growth.along_itself < 0
+    is_unstable &= growth.rayleigh_quotient < 0
     if not np.any(is_unstable):
         return None
-    place = _place(problem, numbers[np.argmax(is_unstable)])
+    first_unstable = step_numbers[np.argmax(is_unstable)]
+    where = _where_step_begins(problem, first_unstable)
     return (
         f"Steps of `dt0={dt0:g}` are too long for `{type(problem.solver).__name__}` "
-        f"{place}: a small change of the state grows in each step, with alternating signs. "
+        f"{where}: a small change of the state grows in each step, with alternating signs. "
         "Where forces are bounded, such steps leave random states, and two levels may "
         "agree on a wrong mean. Pass a smaller `dt0`."
     )
 
 
-def _unresolved_frequency(problem: Problem, dt0: float, most: float) -> str | None:
-    """`too_long_steps` for an implicit solver with this `Record.most_frequency`."""
-    angle, number = _largest_angle(problem)
-    if not angle > most:
+def _unresolved_frequency(
+    problem: Problem, dt0: float, most_frequency: float
+) -> str | None:
+    """`too_long_steps` for an implicit solver with this `Record.most_frequency`, which is
+    the largest omega h that it resolves."""
+    angle, step_number = _largest_angle(problem)
+    if not angle > most_frequency:
         return None
-    place = _place(problem, number)
     return (
         f"Steps of `dt0={dt0:g}` are too long for `{type(problem.solver).__name__}` "
-        f"{place}: omega h = {angle:.3g} for the largest frequency of the drift, "
-        f"and with omega h > {most:g} two levels may agree on a wrong mean. Pass a smaller "
-        "`dt0`, or `levels=3`, which checks the order."
+        f"{_where_step_begins(problem, step_number)}: omega h = {angle:.3g} for the "
+        f"largest frequency of the drift, and with omega h > {most_frequency:g} two levels "
+        "may agree on a wrong mean. Pass a smaller `dt0`, or `levels=3`, which checks the "
+        "order."
     )
 
 
 def _lost_decay(problem: Problem, dt0: float) -> str | None:
     """`too_long_steps` for an implicit solver and modes that decay slowly and turn far in a
-    step: it keeps them, on every level."""
-    largest_angle, number = _largest_angle(problem)
+    step: it hardly lets them decay, on any level."""
+    largest_angle, step_number = _largest_angle(problem)
     if not largest_angle > _TURNS_TOO_FAR_TO_DECAY:
         return None
     num_modes = sum(np.size(leaf) for leaf in jtu.tree_leaves(problem.y0))
     if num_modes > _MOST_MODES:
         return None
-    rates = np.linalg.eigvals(np.asarray(_quick_modes(problem, number), float))
+    jacobian = np.asarray(_quick_jacobian(problem, step_number), float)
+    # A mode decays with the negative real part of its eigenvalue, and turns with the
+    # imaginary part.
+    eigenvalues = np.linalg.eigvals(jacobian)
+    decay_rates = -eigenvalues.real
     duration = float(problem.level(0).num_steps) * dt0
-    # Rounding, and modes of a Hamiltonian that grow and decay in pairs, are no decay.
-    least_rate = max(_LEAST_DECAY / duration, _ROUNDING * np.max(np.abs(rates)))
-    is_kept = np.abs(rates.imag) * dt0 > _TURNS_TOO_FAR_TO_DECAY
-    is_kept &= -rates.real > least_rate
-    if not np.any(is_kept) or not -np.sum(rates.real) > least_rate:
+    least_rate = max(
+        _LEAST_DECAY / duration, _ROUNDING_OF_RATES * np.max(np.abs(eigenvalues))
+    )
+    is_kept = np.abs(eigenvalues.imag) * dt0 > _TURNS_TOO_FAR_TO_DECAY
+    is_kept &= decay_rates > least_rate
+    # Without friction, modes grow and decay in pairs, and these rates add up to zero.
+    is_dissipative = np.sum(decay_rates) > least_rate
+    if not np.any(is_kept) or not is_dissipative:
         return None
-    angle = np.max(np.abs(rates.imag[is_kept])) * dt0
+    angle = np.max(np.abs(eigenvalues.imag[is_kept])) * dt0
     return (
         f"Steps of `dt0={dt0:g}` are too long for `{type(problem.solver).__name__}` "
-        f"{_place(problem, number)}: a mode with omega h = {angle:.3g} decays, and "
-        f"implicit steps that turn it by more than {_TURNS_TOO_FAR_TO_DECAY:g} keep it, so "
-        "that it relaxes far too slowly on every level. Pass a smaller `dt0`, or for "
-        "Langevin terms `BAOAB(ImplicitMidpoint())`, which solves the friction by itself."
+        f"{_where_step_begins(problem, step_number)}: a mode with "
+        f"omega h = {angle:.3g} decays, and implicit steps that turn it by more than "
+        f"{_TURNS_TOO_FAR_TO_DECAY:g} keep it, so that it relaxes far too slowly on every "
+        "level. Pass a smaller `dt0`, or for Langevin terms `BAOAB(ImplicitMidpoint())`, "
+        "which solves the friction by itself."
     )
 
 
@@ -178,11 +192,11 @@ def unresolved_angle(problem: Problem) -> float | None:
 def _largest_angle(problem: Problem) -> tuple[float, float]:
     """The largest angle by which a step on the first level turns the state in which paths
     start, by the drift without friction, in radians; and the number of this step."""
-    numbers = _numbers_of_steps(problem)
-    frequencies = np.asarray(_quick_frequencies(problem, numbers))
+    step_numbers = _step_numbers_to_look_at(problem)
+    frequencies = np.asarray(_quick_frequencies(problem, step_numbers))
     largest = np.argmax(frequencies)
     angle = float(frequencies[largest]) * float(problem.level(0).h)
-    return angle, numbers[largest]
+    return angle, step_numbers[largest]
 
 
 def unresolved_noise(problem: Problem, dt0: float) -> str | None:
@@ -211,8 +225,9 @@ def _noise_of_user(problem: Problem) -> Terms:
 
 @once_for_each_signature
 def _noise_reads_state(problem: Problem) -> bool:
-    """Whether the change of the state by noise, but that of heat baths, reads the state in
-    its program. (At `y0` it may read it to no effect.)"""
+    """Whether the change of the state by noise depends on the state, apart from the noise
+    of heat baths. Its program is looked at, not its derivative, which may be zero at
+    `y0`."""
     noise = _noise_of_user(problem)
     if not noise:
         return False
@@ -232,7 +247,7 @@ def _zero_controls(
     return zeros_and_unravel([control_struct(term, problem.t0) for term in noise])
 
 
-def _numbers_of_steps(problem: Problem) -> Float[np.ndarray, " times"]:
+def _step_numbers_to_look_at(problem: Problem) -> Float[np.ndarray, " times"]:
     """The numbers of the steps to look at: the first alone if the drift does not depend on
     time."""
     drift, _, _ = split_friction(problem.terms)
@@ -243,11 +258,11 @@ def _numbers_of_steps(problem: Problem) -> Float[np.ndarray, " times"]:
     return np.floor(spread_evenly(_NUM_TIMES) * num_steps).astype(problem.dtype)
 
 
-def _place(problem: Problem, number: float) -> str:
-    """Where a step begins, for messages."""
-    if number == 0:
+def _where_step_begins(problem: Problem, step_number: float) -> str:
+    """Where a step on the first level begins, for messages."""
+    if step_number == 0:
         return "where paths start"
-    t = float(problem.t0) + number * float(problem.level(0).h)
+    t = float(problem.t0) + step_number * float(problem.level(0).h)
     return f"at t = {t:.4g}, for the state in which paths start"
 
 
@@ -284,7 +299,7 @@ def _terms_without_noise(problem: Problem, h: Any) -> PyTree:
 
 def _short_step_succeeds(problem: Problem) -> Bool[Array, ""]:
     """Whether a very short step without noise succeeds, with a finite `phi` after it."""
-    h = _SHORT * problem.level(0).h
+    h = _SURELY_SHORT_FRACTION * problem.level(0).h
     terms = _terms_without_noise(problem, h)
     state = problem.init(terms, 0, h, problem.y0)
     y, _, success = problem.step(terms, 0, h, problem.y0, state)
@@ -292,8 +307,8 @@ def _short_step_succeeds(problem: Problem) -> Bool[Array, ""]:
 
 
 def _growth(problem: Problem, numbers: Float[Array, " times"]) -> Growth:
-    """The growth of the change that a step from `y0` enlarges most, by the derivative of
-    the step; for the steps with these numbers."""
+    """For each of the steps with these numbers, started from `y0`: the growth of the change
+    of `y0` that the derivative of the step enlarges most."""
     h = problem.level(0).h
     terms = _terms_without_noise(problem, h)
     flat_y0, unravel = jfu.ravel_pytree(problem.y0)
@@ -305,7 +320,8 @@ def _growth(problem: Problem, numbers: Float[Array, " times"]) -> Growth:
             y1, *_ = problem.step(terms, number, h, y, state)
             return jfu.ravel_pytree(y1)[0]
 
-        return largest_growth(derivative_at(step, flat_y0), flat_y0, _ITERATIONS)
+        derivative = derivative_at(step, flat_y0)
+        return largest_growth(derivative, flat_y0, _ITERATIONS_FOR_INSTABILITY)
 
     # This compiles faster than `jax.vmap`, and takes less memory.
     return lax.map(growth_in_step, numbers)
@@ -334,13 +350,14 @@ def _frequencies(
     return lax.map(frequency, numbers)
 
 
-def _modes(problem: Problem, number: Float[Array, ""]) -> Float[Array, "n n"]:
-    """The derivative at `y0` of the drift that a step solves as a whole: with friction,
-    unless a splitting solves it apart. At the start of the step with this number."""
+def _jacobian(problem: Problem, step_number: Float[Array, ""]) -> Float[Array, "n n"]:
+    """The derivative at `y0`, at the start of the step with this number, of the drift that
+    the implicit equations of a step contain: with the friction, except for splittings,
+    which solve the friction by itself."""
     drift, friction, _ = split_friction(problem.terms)
     if isinstance(problem.solver, AbstractLangevinSplitting):
         friction = ()
-    t = problem.t0 + number * problem.level(0).h
+    t = problem.t0 + step_number * problem.level(0).h
     flat_y0, unravel = jfu.ravel_pytree(problem.y0)
 
     def rate_of_drift(x: Array) -> Array:
@@ -377,20 +394,21 @@ def _frequency_of(
     where growth without oscillation is faster."""
     derivative = derivative_at(rate_of, x)
 
-    # An oscillation has a pair of eigenvalues, i omega and -i omega. Applied twice, the
-    # derivative has -omega^2 in the whole plane of the oscillation.
+    # The derivative has the eigenvalues i omega and -i omega of an oscillation, for which
+    # power iteration does not converge. Its square has -omega^2 for all directions in the
+    # plane of the oscillation.
     def derivative_twice(change: Array) -> Array:
         # A loop, so that the derivative is compiled once.
         return lax.fori_loop(0, 2, lambda _, change: derivative(change), change)
 
     growth = largest_growth(derivative_twice, x, _ITERATIONS_FOR_FREQUENCY)
-    oscillates = growth.along_itself < 0
-    # Changes grow by omega^2.
+    oscillates = growth.rayleigh_quotient < 0
+    # Each application multiplies by omega^2, so omega is the root of the growth.
     return jnp.where(oscillates, jnp.exp(growth.log_growth / 2), 0)
 
 
 _quick_growth = compiled(_growth, quickly=True)
 _quick_frequencies = compiled(_frequencies, quickly=True)
-_quick_modes = compiled(_modes, quickly=True)
+_quick_jacobian = compiled(_jacobian, quickly=True)
 _quick_noise_frequency = compiled(_noise_frequency, quickly=True)
 _quick_short_step_succeeds = compiled(_short_step_succeeds, quickly=True)

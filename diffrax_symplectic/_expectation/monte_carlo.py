@@ -133,16 +133,17 @@ def monte_carlo(
     progress = Progress("monte_carlo", progress_meter, "a small `num_paths`")
     with ShortTraceback(), Kept() as kept, progress:
         # A level is a Python integer, by which a function may choose its step, so each
-        # level is a program of its own.
+        # level is a program of its own. With one level, `fn` takes the key alone.
+        arguments_after_key = [()] if levels == 1 else [(k,) for k in range(levels)]
         with current_traces(fn):
             programs = [
-                traced(jtu.Partial(_value_and_success, fn, level), key, identity=fn)
-                for level in ([()] if levels == 1 else [(k,) for k in range(levels)])
+                traced(jtu.Partial(_value_and_success, fn, given), key, identity=fn)
+                for given in arguments_after_key
             ]
         check_untraced("`monte_carlo`", programs)
         sampler = jtu.Partial(_samples_of_programs, programs, weights)
         outputs = _outputs(programs, key, len(weights))
-        # A number on each level, or more.
+        # At least a number of four bytes on each level.
         bytes_of_path = 4 * levels
         plan = sampling.plan(sampler, outputs, devices, bytes_of_path)
         plan = plan._replace(digests=dict(fn=digest(programs), order=digest(order)))
@@ -167,7 +168,7 @@ def _outputs(
             "`fn` must return a phi of the same structure and shapes on all levels; got "
             f"{', '.join(map(shapes, structs))}."
         )
-    # Rounding is that of the least precise numbers.
+    # Rounding errors are estimated by the least precise of the dtypes.
     dtypes = {leaf.dtype for leaf in jtu.tree_leaves(structs)}
     dtype = min(dtypes, key=lambda dtype: jnp.finfo(dtype).bits)
     return Outputs(layout, len(programs), num_combinations, str(dtype))

@@ -22,9 +22,9 @@ _ARITHMETIC = {"mul": "*", "div": "/", "integer_pow": "to a power", "square": "s
 
 
 def out_of_range(problem: Problem, all_fail: bool) -> str | None:
-    """Names an argument that counts as zero or infinite in its precision; or if
-    `all_fail`, which paths do, an operation of the first step whose result is out of range.
-    Two sentences for messages, or `None`."""
+    """Names an argument that counts as zero or infinite in its precision; or else, if
+    `all_fail` (whether paths do), an operation whose result is out of range where paths
+    start. Two sentences for messages, or `None`."""
     precision = jnp.finfo(problem.dtype)
     drift, noise = split_terms(problem.terms)
     terms = (*drift, *noise)
@@ -43,7 +43,8 @@ def out_of_range(problem: Problem, all_fail: bool) -> str | None:
 
 
 def _lost_arguments(problem: Problem, terms: Terms) -> Iterator[str]:
-    """The arguments with an array whose numbers all count as zero, or one as infinite."""
+    """Names each argument with an array in which all numbers count as zero, though not all
+    are, or a finite one counts as infinite."""
     arguments = {"y0": problem.y0, "args": problem.args, "dt0": problem.levels.h[0]}
     baths = [term for term in terms if isinstance(term, BathNoise)]
     for bath in baths:
@@ -63,8 +64,9 @@ def _lost_arguments(problem: Problem, terms: Terms) -> Iterator[str]:
 
 
 def _lost_on_the_way(problem: Problem, terms: Terms) -> str | None:
-    """The first operation whose result is out of range, if the change of the state or `phi`
-    is not finite at the start."""
+    """Names the first operation whose result is out of range, if the change of the state or
+    `phi` is not finite at the start; `None` otherwise. Evaluates both one operation after
+    another, to look at the results in between."""
     t0, y0, args = problem.t0, problem.y0, problem.args
     leaves, treedef = jtu.tree_flatten(y0)
 
@@ -97,19 +99,21 @@ def _ones(struct: jax.ShapeDtypeStruct) -> Array:
 
 
 def _loss(name: str, values: list[Any], result: Any) -> Iterator[str]:
-    """An entry that overflowed or underflowed in an operation of arithmetic."""
-    result = _in_float64(result)
-    operands = [np.broadcast_to(_in_float64(x), result.shape).ravel() for x in values]
-    result = result.ravel()
-    # Zeros and infinities that stem from others are no losses.
-    is_fine = np.all([np.isfinite(x) & (x != 0) for x in operands], axis=0)
-    is_lost = is_fine & ((result == 0) | ~np.isfinite(result))
+    """The first entry that overflowed or underflowed in an operation of arithmetic, such as
+    `1e-30 * 1e-30 is 0`; nothing if there is none."""
+    wide_result = _in_float64(result)
+    shape = wide_result.shape
+    operands = [np.broadcast_to(_in_float64(x), shape).ravel() for x in values]
+    results = wide_result.ravel()
+    # If an operand is already zero or infinite, so may be the result, with nothing lost.
+    has_size = np.all([np.isfinite(x) & (x != 0) for x in operands], axis=0)
+    is_lost = has_size & ((results == 0) | ~np.isfinite(results))
     if np.any(is_lost):
         first = int(np.argmax(is_lost))
         texts = [f"{operand[first]:.2g}" for operand in operands]
         sign = _ARITHMETIC[name]
-        text = f" {sign} ".join(texts) if len(texts) > 1 else f"{texts[0]} {sign}"
-        yield f"{text} is {'0' if result[first] == 0 else 'infinite'}"
+        formula = f" {sign} ".join(texts) if len(texts) > 1 else f"{texts[0]} {sign}"
+        yield f"{formula} is {'0' if results[first] == 0 else 'infinite'}"
 
 
 def _is_float(x: Any) -> bool:

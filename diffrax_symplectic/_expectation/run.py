@@ -63,9 +63,11 @@ def run(
 ) -> Expectation:
     """The estimate from the samples of a plan, which continues `start`, or without it
     begins with sample number `first`. With a tolerance `tol` it may end before all samples
-    of the plan. The result does not depend on the number of devices. `ts` is that of
-    `Expectation`. `kept` gets the estimate after each batch; trials have none."""
-    # The first sample of all, and the first that is not in `start`.
+    of the plan. The result does not depend on the number of devices. `ts` and `sampling`
+    become fields of the result. `kept`, if there is one, gets the estimate after each
+    batch, for the case of an interrupt."""
+    # The numbers of the first sample of all, of the first that is not in `start`, and one
+    # past the last.
     begin = first if start is None else start.moments[0].begin
     next_sample = first if start is None else start.moments[-1].end
     end = begin + plan.num_samples
@@ -107,12 +109,13 @@ def run(
     running_batches: collections.deque[_RunningBatch] = collections.deque()
     # One past the last sample of the batches that were started.
     end_of_started = next_sample
+    # Batches are started one ahead: while a batch is being computed, the one before it is
+    # added to the estimate.
     while True:
         starts_batch = end_of_started < end and not needs_no_more_samples()
         if starts_batch:
             running_batches.append(batches.start(end_of_started, end))
             end_of_started += batches.size * len(devices)
-        # While the batch just started is being computed, the one before is added up.
         has_previous = len(running_batches) > (1 if starts_batch else 0)
         if has_previous:
             for device_moments in batches.moments_of_devices(running_batches.popleft()):
@@ -146,7 +149,8 @@ def _with_batch(
     batch_size: int,
     end: int,
 ) -> Expectation:
-    """The estimate with the next batch, of which samples before number `end` count."""
+    """The estimate with the next batch, of one device. Only the samples before number `end`
+    count."""
     begin = _end_of(estimate)
     batch_end = min(begin + batch_size, end)
     new_moments = _in_float64(device_moments, begin, batch_end)
@@ -157,8 +161,8 @@ def _with_batch(
 class _RunningBatch(NamedTuple):
     """A batch that has been started.
 
-    - `first`, `end`: the number of its first sample, and from which on samples do not
-        count.
+    - `first`: the number of its first sample.
+    - `end`: samples with this number and larger ones do not count.
     - `has_newton`: whether Newton's method solves steps that sweeps do not.
     - `moments`: the moments on all devices, once they are computed.
     """
@@ -172,9 +176,9 @@ class _RunningBatch(NamedTuple):
 class _Batches:
     """The batches of a plan, in each of which every device takes `size` samples.
 
-    Steps are first solved by sweeps alone: Newton's method is a third of the time to
-    compile an implicit step, and hardly a path needs it. From the first batch on of which a
-    path fails, Newton's method takes part."""
+    Steps are first solved by sweeps alone: Newton's method would take a third of the time
+    to compile an implicit step, and few paths need it. Once a path fails, its batch is
+    computed again with Newton's method, which also takes part in all later batches."""
 
     def __init__(self, plan: SamplingPlan, key: PRNGKeyArray, devices: Devices):
         self.size = min(plan.batch_size, plan.num_samples)
@@ -182,7 +186,7 @@ class _Batches:
         self._key_impl = jr.key_impl(key)
         self._sampler_with_newton = _for_all_processes(plan.sampler)
         self._sampler = self._sampler_with_newton
-        # Paths that are computed outside JAX have been solved by then.
+        # `simulate_paths` solves the steps before the sampler is called.
         if plan.simulate_paths is None and _has_newton(plan.sampler):
             self._sampler = _for_all_processes(_by_sweeps_alone(plan.sampler))
         self._simulate_paths = plan.simulate_paths
@@ -197,19 +201,19 @@ class _Batches:
         if self._simulate_paths is None:
             return self._sampler
         paths = self._simulate_paths(first, self.size)
-        # The sampler is an argument of a function: JAX would take the inner `Partial` of a
-        # `Partial` for its function, with the arrays in it, and compile anew for each.
+        # Not `jtu.Partial(self._sampler, paths)`: the function of a `Partial` is static, so
+        # with arrays in it, as in the sampler, JAX would compile for each batch.
         return jtu.Partial(_samples_of_paths, self._sampler, paths)
 
     def start(self, first: int, end: int) -> "_RunningBatch":
         """Starts a batch on all devices, from sample number `first` on. Samples from number
         `end` on do not count."""
-        moments = self._batch_moments(*self._arguments(first, end))
+        moments = self._batch_moments(*self._arguments_of_batch(first, end))
         has_newton = self._sampler is self._sampler_with_newton
         return _RunningBatch(first, end, has_newton, moments)
 
-    def _arguments(self, first: int, end: int) -> tuple[Any, ...]:
-        """The arguments of `batch_moments`."""
+    def _arguments_of_batch(self, first: int, end: int) -> tuple[Any, ...]:
+        """The arguments of `batch_moments` for `start(first, end)`."""
         num_devices = len(self._devices)
         low_high = np.array([first & 0xFFFFFFFF, first >> 32], np.uint32)
         num_wanted = max(0, min(self.size * num_devices, end - first))
@@ -231,13 +235,13 @@ class _Batches:
         """The moments on each device, copied to the host as soon as they are computed."""
         # The moments are traced if a function closes over traced values.
         check_untraced("`expectation` or `monte_carlo`", running_batch.moments)
-        arrays = jax.device_get(running_batch.moments)
-        if not running_batch.has_newton and np.any(arrays.any_failed):
+        moments = jax.device_get(running_batch.moments)
+        if not running_batch.has_newton and np.any(moments.any_failed):
             self._sampler = self._sampler_with_newton
             again = self.start(running_batch.first, running_batch.end)
-            arrays = jax.device_get(again.moments)
+            moments = jax.device_get(again.moments)
         num_devices = len(self._devices)
-        return [jtu.tree_map(lambda x, k=k: x[k], arrays) for k in range(num_devices)]
+        return [jtu.tree_map(lambda x, k=k: x[k], moments) for k in range(num_devices)]
 
 
 def _is_problem(x: Any) -> bool:
@@ -263,11 +267,12 @@ def _by_sweeps_alone(sampler: Callable[..., Samples]) -> Callable[..., Samples]:
 
 
 def _for_all_processes(sampler: Callable[..., Samples]) -> Callable[..., Samples]:
-    """The sampler, for as many processes as there are."""
+    """The sampler itself, or for several processes a function that captures it."""
     if jax.process_count() == 1:
         return sampler
-    # All processes hold the same arrays. Captured by a function they become constants; as
-    # arguments they would have to be placed on all devices.
+    # The arrays in a sampler are arguments of a program, which would have to be placed on
+    # the devices of all processes. In a function they are constants of the program, which
+    # all processes have alike.
     return lambda keys: sampler(keys)
 
 
@@ -317,7 +322,8 @@ def _in_float64(device_moments: BatchMoments, begin: int, end: int) -> Moments:
 def _needs_no_more_samples(
     estimate: Expectation, plan: SamplingPlan, tol: float | None
 ) -> bool:
-    """Whether there are enough samples for the tolerance, or more would not help."""
+    """Whether there are enough samples for the tolerance, or more would not help: because
+    the error of the steps, or of failed paths, is too large beside that of sampling."""
     least = plan.least_beside_steps if tol is None else plan.least_samples
     if least is None or estimate.num_samples < least:
         return False

@@ -35,11 +35,11 @@ from .fields_in_time import drift_field
 from .linear_maps import derivative_at, largest_growth
 
 
-# With a flow, a mode that turns by more than this in a step, and whose momentum decays at
-# more than this rate times the step, relaxes too slowly: from friction and frequencies of 2
-# in units of 1 / h on, a step takes its position to the other side.
-_RESOLVED = 2.0
-# Of power iteration, before and after what counts.
+# With a flow, a mode relaxes too slowly if it turns by more than this in a step, and the
+# rate of its friction times the step is more than this, too. Its position then changes
+# sign in each step.
+_MOST_BY_FLOW = 2.0
+# So many applications of power iteration find a direction, and as many more measure it.
 _ITERATIONS = 15
 # Where friction changes along a step by more than the first number, and over `dt0` damps
 # momenta at more than the second, two levels may be wrong together. Measured for the mean
@@ -54,8 +54,8 @@ _HARDLY_DAMPED = 1.0
 # 2^-16 of the largest rate have forgotten where they began.
 _VELOCITIES = 16
 _DOUBLINGS = 16
-# The cosine of the angle up to which changes count as parallel.
-_PARALLEL = 0.9
+# Two directions count as parallel if the cosine of the angle between them is above this.
+_COSINE_OF_PARALLEL = 0.9
 
 
 class _Rates(NamedTuple):
@@ -82,27 +82,28 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
         return None
     drift, friction, noise = split_friction(problem.terms)
     record = solver.record
-    most = None if record is None else record.most_friction
-    if drift and noise and not friction and most is not None:
-        return _unresolved_decay(problem, dt0, most)
+    # In units of 1 / `dt0`; `None` if the solver takes every friction.
+    most_friction = None if record is None else record.most_friction
+    if drift and noise and not friction and most_friction is not None:
+        return _unresolved_decay(problem, dt0, most_friction)
     if not friction or not noise:
         return None
     has_flow = isinstance(solver, AbstractLangevinSplitting) and solver.has_flow
     may_change = _depends_on_positions(problem, friction)
-    if most is None and not has_flow and not may_change:
+    if most_friction is None and not has_flow and not may_change:
         return None
     rates = _quick_rates(problem)
     name = type(solver).__name__
     friction_of_step = float(rates.friction) * dt0
     angle = float(rates.squared_frequency) ** 0.5 * dt0
-    if most is not None and friction_of_step > most:
+    if most_friction is not None and friction_of_step > most_friction:
         return (
             f"Steps of `dt0={dt0:g}` do not resolve the friction: momenta decay at a rate "
             f"of {friction_of_step:.3g} / `dt0` where paths start, and `{name}` has the "
-            f"right temperature only up to {most:g} / `dt0`. Pass a smaller `dt0`, or "
-            "`BAOAB()`, which takes every friction."
+            f"right temperature only up to {most_friction:g} / `dt0`. Pass a smaller "
+            "`dt0`, or `BAOAB()`, which takes every friction."
         )
-    if has_flow and friction_of_step > _RESOLVED and angle > _RESOLVED:
+    if has_flow and friction_of_step > _MOST_BY_FLOW and angle > _MOST_BY_FLOW:
         return (
             f"Steps of `dt0={dt0:g}` do not resolve a vibration with strong friction, "
             f"omega h = {angle:.3g} where paths start: with a `flow`, `{name}` keeps its "
@@ -115,17 +116,17 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
     return None
 
 
-def _unresolved_decay(problem: Problem, dt0: float, most: float) -> str | None:
+def _unresolved_decay(problem: Problem, dt0: float, most_friction: float) -> str | None:
     """`unresolved_friction` for friction that is a part of the drift, such as the loss of a
     wave. Only a state that decays hardly oscillating counts."""
     decay = float(_quick_decay(problem)) * dt0
-    if not decay > most:
+    if not decay > most_friction:
         return None
     return (
         f"Steps of `dt0={dt0:g}` do not resolve a decay: where paths start, the drift "
         f"damps the state at a rate of {decay:.3g} / `dt0`, and "
         f"`{type(problem.solver).__name__}` has the right size of fluctuations only up to "
-        f"{most:g} / `dt0`. Pass a smaller `dt0`."
+        f"{most_friction:g} / `dt0`. Pass a smaller `dt0`."
     )
 
 
@@ -146,7 +147,8 @@ def _unresolved_change(
 
 
 def _depends_on_positions(problem: Problem, friction: Terms) -> bool:
-    """Whether the friction reads positions, by its dependence, not by its values."""
+    """Whether the friction depends on positions: whether its program reads them. (Forces at
+    several positions might be equal by chance.)"""
     p0, q0 = problem.y0
 
     def force(q: PyTree[Array], velocity: PyTree[Array]) -> Float[Array, " n"]:
@@ -166,18 +168,18 @@ def _friction_force(
 
 
 def _change_along_step(problem: Problem, dt0: float) -> Float[Array, ""]:
-    """The change of the friction along one step at thermal velocities, in proportion to the
-    friction where paths start: the root mean square over a few velocities of the change of
-    the force on them."""
+    """How much the friction changes with positions along one step, relative to the friction
+    where paths start. For a few thermal velocities, the force of the friction on the same
+    velocity is compared before and after the step, in the root mean square."""
     drift, friction, noise = split_friction(problem.terms)
     bath_noise = tuple(term for term in noise if isinstance(unwrapped(term), BathNoise))
     p0, q0 = problem.y0
     controls = [control_struct(term, problem.t0) for term in bath_noise]
 
     def thermal_momentum(key: PRNGKeyArray) -> PyTree[Array]:
-        """A momentum with the law of the bath. A step of the bath keeps this law whatever
-        its length: the first ones heat what decays fast, the last ones what decays
-        slowly."""
+        """A momentum with the law of the bath, by steps of the bath alone, which keep this
+        law whatever their length. The first, short ones draw the parts of the momentum that
+        decay fast, and the last, long ones those that decay slowly."""
 
         def step_of_bath(number: Array, p: PyTree[Array]) -> PyTree[Array]:
             h = dt0 * 2.0**number
@@ -237,20 +239,26 @@ def _rates(problem: Problem) -> _Rates:
         dp, _ = rate(drift, problem.t0, y, problem.args)
         return jfu.ravel_pytree(dp)[0]
 
-    damped = derivative_at(friction_force, flat_p)
-    moved = derivative_at(velocity, flat_p)
-    pushed = derivative_at(force, flat_q)
+    # The derivatives of the equation `dp/dt = force(q) + friction_force(p)`,
+    # `dq/dt = velocity(p)`, each a linear map of changes of `p` or `q`.
+    force_by_p = derivative_at(friction_force, flat_p)
+    velocity_by_p = derivative_at(velocity, flat_p)
+    force_by_q = derivative_at(force, flat_q)
 
-    def accelerated(change: Array) -> Array:
-        return pushed(moved(change))
+    def second_derivative_of_p(change: Array) -> Array:
+        return force_by_q(velocity_by_p(change))
 
-    def decay(derivative: Callable[[Array], Array]) -> Float[Array, ""]:
-        # The eigenvalues are real for symmetric masses, friction and stiffness, and
-        # negative where friction damps and where the potential is stable.
-        growth = largest_growth(derivative, flat_p, _ITERATIONS)
-        return jnp.maximum(-growth.along_itself, 0)
+    def negative_eigenvalue(linear: Callable[[Array], Array]) -> Float[Array, ""]:
+        """The size of the largest eigenvalue if that is negative, and otherwise zero."""
+        # Eigenvalues are real for symmetric masses, friction and stiffness. They are
+        # negative where friction damps, and where the potential is stable.
+        growth = largest_growth(linear, flat_p, _ITERATIONS)
+        return jnp.maximum(-growth.rayleigh_quotient, 0)
 
-    return _Rates(decay(damped), decay(accelerated))
+    return _Rates(
+        friction=negative_eigenvalue(force_by_p),
+        squared_frequency=negative_eigenvalue(second_derivative_of_p),
+    )
 
 
 def _decay(problem: Problem) -> Float[Array, ""]:
@@ -264,18 +272,20 @@ def _decay(problem: Problem) -> Float[Array, ""]:
         return field(jnp.asarray(problem.t0), unravel(x))
 
     derivative = derivative_at(rate_of_drift, flat_y0)
-    change = largest_growth(derivative, flat_y0, _ITERATIONS).change
-    once = derivative(change)
+    direction = largest_growth(derivative, flat_y0, _ITERATIONS).direction
+    once = derivative(direction)
     twice = derivative(once)
-    # An oscillation may be turned around once, if its parts have different units, but then
-    # not back.
-    turns_around = _cosine(change, once) < -_PARALLEL
-    turns_back = _cosine(change, twice) > _PARALLEL
+    # The derivative of a decay turns its direction around, and applied twice back again.
+    # That of an oscillation may also turn it around, where positions and momenta differ
+    # much in size. But applied twice it is -omega^2, which does not turn it back.
+    turns_around = _cosine(direction, once) < -_COSINE_OF_PARALLEL
+    turns_back = _cosine(direction, twice) > _COSINE_OF_PARALLEL
+    # Where the derivative is zero, cosines are NaN, and both comparisons false.
     return jnp.where(turns_around & turns_back, jnp.linalg.norm(once), 0)
 
 
 def _cosine(x: Float[Array, " n"], y: Float[Array, " n"]) -> Float[Array, ""]:
-    """Of the angle between two vectors; not a number if one is zero."""
+    """The cosine of the angle between two vectors; NaN if one of them is zero."""
     return x @ y / (jnp.linalg.norm(x) * jnp.linalg.norm(y))
 
 

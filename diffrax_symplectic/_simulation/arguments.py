@@ -46,8 +46,9 @@ from .._terms import (
 # Times are given in decimals, so a quotient of times counts as a whole number of steps if
 # it differs from one by at most this fraction of it.
 _TIME_ROUNDING = 1e-6
-# Cells are given in decimals, too. A step that begins farther from the start of a cell, in
-# units of the cell, would take the increment of another cell.
+# Cells are given in decimals, too, so a time counts as a multiple of a cell if their
+# quotient differs from a whole number by at most this. (With a larger difference a step
+# would take the increment of another cell.)
 _CELL_ROUNDING = 1e-3
 # A loss of variance beyond this fraction is a warning. In a heat bath the temperature falls
 # by the same fraction.
@@ -68,9 +69,9 @@ class StepNumbers(NamedTuple):
 def checked_key(caller: str, key: Any, others: Any) -> PRNGKeyArray:
     """The key that `caller` was called with, as a typed key. Raises a `ValueError` unless
     it is one random key, and for traced arrays in it or in the other arguments."""
-    # Inside `jit` a new array is traced, too. Functions that close over traced values of
-    # other transformations are found later, when a result that depends on these values is
-    # read.
+    # Inside `jit` any new array is traced, so that this one finds `jit` even if no argument
+    # is traced. Functions that close over traced values of other transformations are found
+    # later, when a result that depends on these values is read.
     new_array = jnp.zeros(())
     check_untraced(f"`{caller}`", (key, others, new_array))
     check_key(key, caller)
@@ -102,10 +103,11 @@ def step_numbers(
             f"`dt0` must be positive, and `t1` after `t0`; got {arguments}."
         )
     times = np.array([end] if ts is None else ts, float).reshape(-1)
-    # The last quotient is the number of all steps.
+    # How many steps there are to each of `times`, and last of all to the end.
     quotients = (np.append(times, end) - begin) / step
     counts = np.round(quotients)
     roundings = _TIME_ROUNDING * np.maximum(counts, 1)
+    # Not `np.any(... > roundings)`, which is false for times that are NaN.
     if not np.all(np.abs(quotients - counts) <= roundings):
         raise ValueError(
             "Choose a `dt0` that divides the intervals between `t0`, `t1` and `ts`: `t1` "
@@ -206,8 +208,8 @@ def warn_of_truncation(terms: PyTree, h: float, stacklevel: int) -> None:
 
 
 def has_discrete_increments(solver: diffrax.AbstractSolver) -> bool:
-    """Whether the path that a solver makes has discrete increments even if paths with the
-    law of the solution are wanted, as for a weak method."""
+    """Whether a solver takes discrete increments only, as weak methods do: whether the path
+    that it makes has them even for `want="strong"`."""
     path = own_path(solver, "strong", (), jr.key(0))
     # The laws of a path of the user's class may be unknown.
     laws = laws_of(path) or {}

@@ -34,8 +34,8 @@ from .loop import values_of_paths
 from .problem import Problem
 
 
-# Stragglers that are a larger share of all paths take most of the time.
-_MOST_STRAGGLERS = 0.05
+# Above this share of all paths, stragglers take most of the time.
+_LARGEST_SHARE_OF_STRAGGLERS = 0.05
 # Dr.Jit aborts the process if two threads call one frozen function at the same time. A
 # kernel uses all cores, so that taking turns costs no time.
 _IN_TURN = threading.RLock()
@@ -45,9 +45,10 @@ def warn_of_stragglers(
     num_stragglers: int, num_failed: int, num_paths: int, stacklevel: int
 ) -> None:
     """Warns if JAX simulated many paths again, besides those that failed."""
-    # JAX does not solve the steps of failed paths either, so for these `engine="jax"`,
-    # which the warning advises, would be no remedy.
-    if num_stragglers - num_failed > _MOST_STRAGGLERS * num_paths:
+    # Failed paths are stragglers that JAX could not solve either. They do not count, since
+    # the warning advises `engine="jax"`, which would not help them.
+    num_rescued = num_stragglers - num_failed
+    if num_rescued > _LARGEST_SHARE_OF_STRAGGLERS * num_paths:
         warnings.warn(
             f"{num_stragglers:,} of {num_paths:,} paths had steps that the fused kernel "
             "did not solve, or the sine or cosine of an angle beyond 2^31 (in single "
@@ -155,12 +156,12 @@ def _fused_batch(
     failed."""
     kernels, lanes, shared = fused_start(problem, key, sample_numbers, level)
     saved_steps = np.asarray(problem.level(level).saved_steps)
-    # For each number of steps, the entries of the states after them: an array for each
-    # entry, along the paths. The kernel is called for the steps between two saved times.
+    # By the number of steps before a saved time: an array (paths,) for each entry of the
+    # state. The kernel is called once for all steps from one saved time to the next.
     entries_after: dict[int, list[np.ndarray]] = {}
     num_steps_done = 0
     for num_steps in np.unique(saved_steps).tolist():
-        # No step comes before a saved time that is `t0`.
+        # There is no step to take if the saved time is `t0`.
         if num_steps > num_steps_done:
             lanes = kernels.advance(lanes, shared, num_steps_done, num_steps)
         num_steps_done = num_steps
@@ -170,7 +171,8 @@ def _fused_batch(
         np.stack([entries_after[step][k] for step in saved_steps.tolist()], axis=1)
         for k in range(len(lanes.y))
     ]
-    # A copy: all arrays of Dr.Jit are freed while no other thread uses it.
+    # A copy, so that no array of Dr.Jit outlives this call, during which no other thread
+    # uses Dr.Jit.
     is_unfinished = np.array(lanes.stopped)
     return Batch(
         y=_states_of_entries(problem.y0, entries),
@@ -259,10 +261,10 @@ def _with_stragglers(
     level: int,
     fused: Batch,
 ) -> Batch:
-    """The paths of a batch, of which the kernel did not finish one or more, with these
-    simulated by JAX."""
-    # To go on from where the kernel stopped, JAX would need the solver's state, too. JAX
-    # begins anew, which also gives the same paths as without a kernel.
+    """The `fused` paths of a batch, in which those that the kernel did not finish, one or
+    more, are replaced by paths that JAX simulates."""
+    # JAX begins anew. To go on from where the kernel stopped it would need the solver's
+    # state, and it would not give the same paths as without a kernel.
     (stragglers,) = np.nonzero(fused.failed)
     num_stragglers = len(stragglers)
     # Their number is rounded up to a power of four, by repeating stragglers, so that JAX
@@ -304,13 +306,14 @@ def _states_of_entries(y0: PyTree, entries: list[np.ndarray]) -> PyTree[np.ndarr
 def _refusal(error: BaseException | None) -> ValueError | None:
     """The error for the user if an operation cannot be replayed; `None` if the error is
     another one, to be raised as it is."""
-    # Dr.Jit wraps errors of the functions from which it records a loop.
-    while error is not None and not isinstance(error, NotReplayed):
-        error = error.__cause__ or error.__context__
-    if error is None:
+    # Dr.Jit raises errors of its own from those of the functions that it records.
+    cause = error
+    while cause is not None and not isinstance(cause, NotReplayed):
+        cause = cause.__cause__ or cause.__context__
+    if cause is None:
         return None
     return ValueError(
-        f'`engine="drjit"` cannot replay {error}{_clause_of_origin(error.location)}. Pass '
+        f'`engine="drjit"` cannot replay {cause}{_clause_of_origin(cause.location)}. Pass '
         '`engine="jax"`, or write the function without it.'
     )
 

@@ -50,19 +50,18 @@ class Layout(NamedTuple):
         return self.treedef.unflatten(arrays)
 
     def labels(self, ts: np.ndarray | None) -> list[str]:
-        """The time, of `ts`, and the place in the PyTree of each number, such as `t=2,
-        ['energy'][0]`; the empty string for a single number."""
+        """A label for each number in the order of a vector: its time and its place in the
+        PyTree, such as `t=2, ['energy'][0]`. Without `ts` the number of the time comes
+        first in the brackets. A single number has an empty label."""
         tree = self.treedef.unflatten([np.zeros(shape) for shape in self.shapes])
         labels = []
         for k in range(1 if self.num_times is None else self.num_times):
             for path, leaf in jtu.tree_leaves_with_path(tree):
                 for index in np.ndindex(leaf.shape):
-                    time = ""
-                    if ts is not None:
-                        time = f"t={ts[k]:.7g}"
-                    elif self.num_times is not None:
-                        index = k, *index
-                    entry = f"[{', '.join(map(str, index))}]" if index else ""
+                    time = "" if ts is None else f"t={ts[k]:.7g}"
+                    is_time_index_needed = ts is None and self.num_times is not None
+                    indices = (k, *index) if is_time_index_needed else index
+                    entry = f"[{', '.join(map(str, indices))}]" if indices else ""
                     place = jtu.keystr(path) + entry
                     labels.append(", ".join(filter(None, (time, place))))
         return labels

@@ -12,9 +12,10 @@ from .._products import tensordot
 from .arguments import StepNumbers
 
 
-# Numbers of steps are 32-bit integers.
-_MOST_STEPS = 2**31
-# One more would have more steps than that.
+# Numbers of steps are 32-bit integers, which are less than this.
+_STEPS_TOO_MANY = 2**31
+# A single step on the first level is 2^30 steps on this many levels; one more level would
+# have too many.
 MOST_LEVELS = 31
 
 
@@ -37,7 +38,7 @@ def levels_of(dt0: float, steps_of_dt0: StepNumbers, levels: int, dtype: Any) ->
     """All levels, along a leading axis: each has half the step of the one before.
     `steps_of_dt0` are the numbers of steps on the first level. Raises a `ValueError` for
     too many steps."""
-    if steps_of_dt0.total * 2.0 ** (levels - 1) >= _MOST_STEPS:
+    if steps_of_dt0.total * 2.0 ** (levels - 1) >= _STEPS_TOO_MANY:
         raise ValueError(
             f"`levels={levels}` halves `dt0` {levels - 1} times, which is more than "
             "2^31 steps. Pass fewer levels: two to four are enough to extrapolate."
@@ -77,20 +78,22 @@ def with_next_level(levels: Level) -> Level:
 class Combination(enum.IntEnum):
     """The rows of `level_weights`."""
 
-    # Extrapolated to step size zero.
+    # The mean, extrapolated to step size zero.
     BEST = 0
-    # With two levels or more: the finest level's mean minus the best, and the change by the
-    # last extrapolation.
+    # With two levels or more: the mean on the finest level minus `BEST`.
     BIAS = 1
+    # `BEST` minus the extrapolation without the coarsest level.
     EXTRAPOLATION = 2
-    # What the last extrapolation would change if it eliminated the first power of the error
-    # only. With two levels these are the same.
+    # The same if the last extrapolation eliminated the first power of the step size only.
+    # (With two levels it does.)
     BY_FIRST_POWER = 3
-    # With three levels or more, for the extrapolations from all but two neighbouring levels
-    # (from one level of three): the change to the last of these three and to the one
-    # before, and the former minus what the order foretells from the latter.
+    # With three levels or more, there are three extrapolations from all but two
+    # neighbouring levels. (Of three levels these are the means on each.) The change from
+    # the second to the third of them, with finer steps:
     LAST = 4
+    # The change from the first to the second.
     BEFORE = 5
+    # `LAST` minus what it should be, by the order of the solver, for this `BEFORE`.
     MISS = 6
 
 
@@ -109,8 +112,7 @@ def level_weights(
     best = _extrapolation_weights(order, levels)
     if levels == 1:
         return best[None]
-    # The extrapolation from all levels but the coarsest, which eliminates one power of the
-    # step size less.
+    # It eliminates one power of the step size less.
     best_without_coarsest = np.append(0.0, _extrapolation_weights(order, levels - 1))
     finest = np.eye(levels)[-1]
     change = finer_change_weights(order, levels - 1)
@@ -135,11 +137,12 @@ def level_weights(
 def finer_change_weights(
     order: int | float, levels: int
 ) -> Float[np.ndarray, " levels_and_one"]:
-    """The combination of the means on `levels` levels and one more that is the change of
-    the extrapolation to step size zero, if the coarsest level is left out for the finest.
-    """
+    """The weights of the means on `levels` levels and one more: the extrapolation to step
+    size zero from all but the coarsest, minus that from all but the finest."""
     weights = _extrapolation_weights(order, levels)
-    return np.append(0.0, weights) - np.append(weights, 0.0)
+    without_coarsest = np.append(0.0, weights)
+    without_finest = np.append(weights, 0.0)
+    return without_coarsest - without_finest
 
 
 def _extrapolation_weights(

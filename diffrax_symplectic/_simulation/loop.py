@@ -18,10 +18,10 @@ from .levels import Level
 from .problem import DrawnStart, Problem
 
 
-# The number of paths that are stepped at once on CPUs. The arrays of more paths overflow
-# the cache in every sweep over their stage equations: for a million paths of `ArrayRQMC` by
-# the midpoint rule blocks save a quarter to a half of the processor time. In smaller blocks
-# the batches of `ensemble` take up to a fifth longer.
+# The number of paths that take a step at once on CPUs. The arrays of more paths would not
+# fit into the cache in every sweep over their stage equations: for a million paths of
+# `ArrayRQMC` by the midpoint rule blocks save a quarter to a half of the processor time. In
+# smaller blocks the batches of `ensemble` take up to a fifth longer.
 _PATHS_AT_ONCE = 2**16
 
 
@@ -77,7 +77,8 @@ class PathStates(eqx.Module):
 def _replaced_where(
     failed: Bool[Array, " n"], values: PyTree, replacements: PyTree
 ) -> PyTree:
-    """The values of all paths, with the replacements for failed ones."""
+    """The values of all paths, with the replacements for failed ones. A replacement is one
+    for all paths, or has an axis of paths, too."""
 
     def replaced(value: Array, replacement: Array) -> Array:
         return jnp.where(mask_like(failed, value), replacement, value)
@@ -142,17 +143,19 @@ def _simulate_level(
     def step_and_measure(i, carry):
         paths, saved = carry
         num_steps = i + 1
-        paths = motion.step(i, paths)
-        return _measure_if_saved(problem, level, measure, num_steps, paths, saved)
+        paths_after_step = motion.step(i, paths)
+        return _measure_if_saved(
+            problem, level, measure, num_steps, paths_after_step, saved
+        )
 
     num_saves, m = problem.output_shape
     num_paths = len(motion.start.failed)
     dtype = problem.dtype_of_values
     phi = jax.ShapeDtypeStruct((num_paths, m), dtype)
     measured = jax.eval_shape(measure, phi, motion.start.failed)
-    saved = jnp.zeros((num_saves, *measured.shape), dtype)
+    nothing_saved = jnp.zeros((num_saves, *measured.shape), dtype)
     # A saved time may be `t0`.
-    carry = _measure_if_saved(problem, level, measure, 0, motion.start, saved)
+    carry = _measure_if_saved(problem, level, measure, 0, motion.start, nothing_saved)
     paths, saved = lax.fori_loop(0, level.num_steps, step_and_measure, carry)
     return Simulated(saved, paths.failed, paths.control)
 
@@ -194,9 +197,9 @@ def independent_motion(
     terms_of: Callable[[Any], PyTree],
     randomness_of_step: Callable[[Any], PyTree[Array]],
 ) -> Motion:
-    """The motion of independent paths from these starts. `randomness_of_step(i)` holds
-    random numbers or keys for step `i`, with a row for each path, and a path has the terms
-    `terms_of(row)` in this step."""
+    """The motion of independent paths from these starts. `randomness_of_step(i)` is a
+    PyTree of random numbers or keys for step `i`, with a row for each path; in this step, a
+    path with this `row` has the terms `terms_of(row)`."""
 
     def step(i: Any, paths: PathStates) -> PathStates:
         def step_of_path(row, y, solver_state, args):
@@ -212,8 +215,8 @@ def independent_motion(
         problem_of_path = problem.with_args(args)
         return problem_of_path.init(terms_of(row), 0, level.h, y)
 
-    # A path that starts from a state that is not finite has a solver state that fits this
-    # state, rather than its replacement in `PathStates.start`: the path has failed anyway.
+    # `PathStates.start` replaces states that are not finite, but solver states are those of
+    # the states before: such a path has failed, so its solver state does not matter.
     solver_state = jax.vmap(solver_state_at_start)(
         randomness_of_step(0), starts.y0, starts.args
     )
@@ -243,9 +246,10 @@ def values_of_paths(
 
 
 def _vmapped_in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
-    """`jax.vmap(fn)(*args)`, on CPUs one block of paths after another."""
+    """`jax.vmap(fn)(*args)`, for many paths on CPUs one block after another."""
     num_paths = len(jtu.tree_leaves(args)[0])
-    # A last block of another size would be compiled for itself.
+    # Numbers of paths that leave a smaller block are not divided: that block would need a
+    # program of its own.
     has_whole_blocks = num_paths > _PATHS_AT_ONCE and num_paths % _PATHS_AT_ONCE == 0
     if not has_whole_blocks or jax.default_backend() != "cpu":
         return jax.vmap(fn)(*args)
@@ -253,7 +257,8 @@ def _vmapped_in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
     def in_blocks(x: Array) -> Array:
         return x.reshape(-1, _PATHS_AT_ONCE, *x.shape[1:])
 
-    # With `batch_size=`, older versions of JAX trace a remainder of no paths, too.
+    # Not `lax.map` with `batch_size`, by which older versions of JAX trace `fn` once more,
+    # for a remainder of no paths.
     results = lax.map(lambda block: jax.vmap(fn)(*block), jtu.tree_map(in_blocks, args))
     return jtu.tree_map(lambda x: x.reshape(num_paths, *x.shape[2:]), results)
 

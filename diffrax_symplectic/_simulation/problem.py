@@ -67,9 +67,9 @@ from .layout import Layout
 from .levels import halved, Level, level_weights, levels_of, MOST_LEVELS
 
 
-# The number that is folded into the key of a sample to draw its `y0` and `args`. The words
-# of the user's keys are folded into the same key for the paths: this number is unlikely to
-# be one of them.
+# The number that is folded into the key of a sample to draw its `y0` and `args`. For the
+# Brownian paths, the words of the user's keys are folded into the same key. This arbitrary
+# number is unlikely to be one of them.
 _START_KEY = 0x517A87
 # The `unit` of truncated increments that are made here, in units of the interval from `t0`
 # to `t1`: one step over all of it loses 0.04% of its variance, which is no warning.
@@ -144,8 +144,8 @@ class Problem(eqx.Module):
         terms = with_paths_for_shapes(terms, ft.partial(own_path, solver, want))
         steps_of_dt0 = step_numbers(t0, t1, dt0, ts)
 
-        # Where `args` or `y0` is drawn, an example takes its place. Any draw has the
-        # structure of all: these keys serve as well as others.
+        # Where `args` or `y0` is drawn, an example takes its place. All draws have the same
+        # structure, so it may be drawn from any key.
         args_of = args if callable(args) else None
         key = jr.key(0) if key is None else key
         if args_of is not None:
@@ -176,20 +176,20 @@ class Problem(eqx.Module):
                 args=args,
             )
 
-        # Other numbers compile nothing anew if they are in arrays. But a function may need
-        # the values of numbers of Python, in an `if`.
+        # With arrays in place of Python numbers, other numbers compile nothing anew. But a
+        # function of the user may need the numbers themselves, for example in an `if`.
         try:
             programs = programs_for(jtu.tree_map(_number_as_array, args))
         except (ValueError, *NEED_VALUES):
             programs = None
-        # Outside of the `except`, since an error there would name both.
+        # Not within `except`: an error would be printed together with the one before.
         if programs is None:
             programs = programs_for(args)
         phi, terms, solver, y0_of, args = programs
-        # What a function closes over shows in its program.
+        # What functions close over is now a part of their programs.
         check_untraced(f"`{caller}`", (phi, terms, solver, y0_of, args_of))
         check_fit(terms, t0_of_dtype, y0, args)
-        # Here the values of `y0` are known. In the program of a solve they are not.
+        # These need the values of `y0`, which in the program of a solve are traced.
         check_assertions(terms, t0_of_dtype, y0, args)
         if constraint_of(terms) is not None:
             check_start(terms, t0_of_dtype, y0, args)
@@ -231,8 +231,8 @@ class Problem(eqx.Module):
         )
 
     def with_any_steps(self) -> "Problem":
-        """The same problem for programs in which no array has room for all steps, so that
-        other numbers of steps compile nothing anew."""
+        """The same problem for programs in which no array has an axis of steps: as
+        `most_steps` is static, they would compile anew for another room."""
         return dataclasses.replace(self, most_steps=0)
 
     def with_half_steps(self) -> "Problem":
@@ -261,7 +261,8 @@ class Problem(eqx.Module):
         level = self.level(0)
 
         def times(num_steps: Any) -> np.ndarray:
-            # In single precision: with other steps the same time is rounded otherwise.
+            # The same time, from steps of other sizes, has other rounding errors. In single
+            # precision these are rounded off.
             return np.asarray(self.t0 + num_steps * level.h, np.float32)
 
         arguments = dict(
@@ -328,8 +329,8 @@ class Problem(eqx.Module):
         # of the next step.
         t = self.t0 + i * h
         next_t = self.t0 + (i + 1) * h
-        # Only arrays are carried from step to step. The rest of the solver's state does not
-        # change: it is taken from `init`, which is traced and not run.
+        # Only arrays are carried from step to step. The rest of the solver's state never
+        # changes: it is taken from an initial state, of which no array is computed.
         initial_state = eqx.filter_eval_shape(
             self.solver.init, terms, t, next_t, y, self.args
         )

@@ -114,7 +114,7 @@ def test_changes_that_noise_would_hide_are_told_apart_from_those_that_are_sure()
     def changes(size, noise):
         return _Changes(
             sizes=np.array([0.0, size]),
-            noise=np.array([1e-6, noise]),
+            std_errors=np.array([1e-6, noise]),
             errors=np.array([0.01, 0.01]),
             num_paths=512,
         )

@@ -17,22 +17,23 @@ from .tolerance import largest_error, shortfall
 # With a `heaviness` above this, means of exp(5 x) with normal x were off by forty standard
 # errors, and means of exp(3 x) by five.
 _HEAVY = 0.35
-# Heavy tails do not matter where this many standard errors are less than the whole error,
-# as for value functions that leave 1e-16 beside a discretization error of 1e-7.
-_NEGLIGIBLE_BELOW = 100
+# Heavy tails do not matter where even this many standard errors are less than the whole
+# error, as for value functions with a standard error of 1e-16 beside a discretization error
+# of 1e-7.
+_NEGLIGIBLE_STD_ERRORS = 100
 # Two steps do not agree if the extrapolation from them changes the mean by more than this
 # share of it. For a method of order 2, the bias of the longer step is four times this
 # change, and thus more than twice the mean.
-_MUCH = 0.5
-# The change must also be this share of the standard deviation of a path: a mean of zero is
-# zero up to its spread, and any change of it is large beside it.
-_MUCH_OF_SPREAD = 0.05
-# The change must also be this many of its standard errors: by chance it is more once in
-# sixteen thousand times.
-_SURE_OF_CHANGE = 4
-# The longer step is too long for the method, rather than paths bad by themselves, if this
-# many times as many paths fail with it as with half of it.
-_MANY_MORE = 10
+_LARGE_SHARE_OF_MEAN = 0.5
+# The change must also be more than this share of the standard deviation of a path: any
+# change is large beside a mean of about zero.
+_LARGE_SHARE_OF_SPREAD = 0.05
+# The change must also be more than this many of its standard errors: by chance it is more
+# once in sixteen thousand times.
+_STD_ERRORS_TO_BE_SURE = 4
+# If this many times as many paths fail with the longer step as with half of it, they fail
+# because it is too long, and not for another reason.
+_MANY_TIMES_MORE = 10
 
 
 def cautions(estimate: Expectation, tol: float | None, advice: str) -> Iterator[str]:
@@ -51,7 +52,7 @@ def cautions(estimate: Expectation, tol: float | None, advice: str) -> Iterator[
 def _cautions_on_failures(estimate: Expectation, advice: str) -> Iterator[str]:
     """Warns of failed paths that could change the mean by more than its standard error."""
     vectors = estimate.vectors
-    # Without samples both are NaN, which is no reason to return.
+    # Without samples both are NaN, so this is false.
     if np.all(vectors.failed_error <= vectors.std_error):
         return
     if estimate.num_samples == 0:
@@ -64,12 +65,12 @@ def _cautions_on_failures(estimate: Expectation, advice: str) -> Iterator[str]:
         )
     if estimate.levels > 1:
         num_with_dt0, num_with_half, *_ = estimate.failed_on
-        if num_with_dt0 > _MANY_MORE * num_with_half:
+        if num_with_dt0 > _MANY_TIMES_MORE * num_with_half:
             consequence += (
                 f"; the first two steps do not agree, since {num_with_dt0:,} paths fail "
                 f"with steps of `dt0` and {num_with_half:,} with half of it"
             )
-            # Where most paths fail, the advice says so.
+            # Where most paths fail, `advice` speaks of the steps already.
             if estimate.num_failed <= estimate.num_paths:
                 advice = f"Pass a smaller `dt0`. {advice}"
     yield f"{estimate.num_failed:,} paths failed: {consequence}. {advice}"
@@ -92,38 +93,39 @@ def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
             "Pass a smaller `degree`, or another `sampling`."
         )
 
-    # Paths that count little would not matter.
-    matters = _NEGLIGIBLE_BELOW * vectors.std_error >= vectors.error
+    matters = _NEGLIGIBLE_STD_ERRORS * vectors.std_error >= vectors.error
+    # Zero where it does not matter.
     heaviness = best.heaviness * matters
-    place = _place_of_largest(heaviness)
-    r = heaviness[place]
+    heaviest = _index_of_largest(heaviness)
+    r = heaviness[heaviest]
     if r > _HEAVY:
-        # For sorted paths, each replicate is looked at by itself.
+        # For sorted paths, `r` is that of the paths of one replicate.
         is_replicate = estimate.paths_per_sample > 1
-        n = estimate.paths_per_sample if is_replicate else estimate.num_samples
-        share = share_of_largest(r, n)
+        num_paths = estimate.paths_per_sample if is_replicate else estimate.num_samples
+        share = share_of_largest(r, num_paths)
         yield (
-            f"One path in {n:,} accounts for {share:.0%} of the variance"
-            f"{label_of(estimate, place)}: still rarer paths may contribute much to the "
+            f"One path in {num_paths:,} accounts for {share:.0%} of the variance"
+            f"{label_of(estimate, heaviest)}: still rarer paths may contribute much to the "
             "mean, and the standard error may be too small. If forces are steep, steps may "
             "be too long on such paths: pass a smaller `dt0`. If `phi` grows fast, average "
             "a function that grows more slowly, or take many more paths."
         )
 
 
-def _place_of_largest(values: np.ndarray) -> int:
-    """The place of the largest of these values, of all numbers of the mean."""
+def _index_of_largest(values: np.ndarray) -> int:
+    """The index of the largest of these values, with zero in place of NaN."""
     return int(np.argmax(np.nan_to_num(values)))
 
 
 def _cautions_on_samples(estimate: Expectation) -> Iterator[str]:
     """Warns of samples that are all zero, or all equal."""
     moments = total(estimate.moments)
-    # Without the control variate, which is not zero where `phi` is.
+    # Without the control variate. With it, a sample is not zero where `phi` is.
     largest_values = moments.size.without_control[Combination.BEST]
     arrays = jtu.tree_leaves(estimate.layout.unravel(largest_values))
     smallest = _smallest_accurate(estimate.dtype)
-    # A single entry of an array may well be zero, as a momentum at the start.
+    # An array of `phi` must be zero as a whole: a single entry may well be, such as that of
+    # a momentum at the start.
     if any(np.max(array) < smallest for array in arrays):
         yield (
             f"An output of `phi` is zero, or underflows {estimate.dtype}, on all paths. If "
@@ -154,19 +156,20 @@ def _cautions_on_steps(estimate: Expectation) -> Iterator[str]:
     # The largest absolute values of samples, by which their rounding is measured.
     size = np.fmax(moments.size.value, moments.size.without_control)[Combination.BEST]
     rounding = ROUNDING * float(jnp.finfo(estimate.dtype).eps) * size
-    is_real = size_of_change > np.maximum(_SURE_OF_CHANGE * change.std_error, rounding)
-    is_large = size_of_change > _MUCH * np.abs(finest)
-    is_seen = size_of_change > _MUCH_OF_SPREAD * _spread_of_paths(estimate)
+    noise = _STD_ERRORS_TO_BE_SURE * change.std_error
+    is_real = size_of_change > np.maximum(noise, rounding)
+    is_large = size_of_change > _LARGE_SHARE_OF_MEAN * np.abs(finest)
+    is_seen = size_of_change > _LARGE_SHARE_OF_SPREAD * _spread_of_paths(estimate)
     # The mean may be zero.
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = size_of_change / np.abs(finest)
-    ratios = np.where(is_real & is_large & is_seen, ratios, 0)
-    place = _place_of_largest(ratios)
-    if ratios[place] > 0:
+    ratios_to_tell = np.where(is_real & is_large & is_seen, ratios, 0)
+    worst = _index_of_largest(ratios_to_tell)
+    if ratios_to_tell[worst] > 0:
         yield (
-            f"The first two steps do not agree{label_of(estimate, place)}: extrapolation "
+            f"The first two steps do not agree{label_of(estimate, worst)}: extrapolation "
             "from steps of `dt0` and half of it changes the mean from "
-            f"{finest[place]:.3g} to {vectors.mean[place]:.3g}. Pass a smaller `dt0`, or "
+            f"{finest[worst]:.3g} to {vectors.mean[worst]:.3g}. Pass a smaller `dt0`, or "
             "`levels=3`, which checks the order."
         )
 

@@ -12,43 +12,45 @@ from .moments import Moments
 
 # A control variate is dropped if its mean is this many standard errors from zero: by chance
 # that happens less than once in a million times.
-_SURE_OF_CONTROL = 5
+_STD_ERRORS_TO_DROP = 5
 # A control variate with a `heaviness` above this is kept all the same: its tails are then
 # so heavy that the standard error of its mean is not reliable.
 _HEAVY_CONTROL = 0.1
 # The largest deviation of n normal samples exceeds the root of this number times log(n), in
 # standard deviations, with a probability of less than n^(-5/4).
-_OUTLYING = 4.5
+_SQUARE_PER_LOG = 4.5
 # The largest `heaviness` that is used: with r = 1, where a single sample accounts for all
 # of the variance, the standard error would be infinite.
-_MOST_HEAVY = 1 - 1e-6
+_LARGEST_HEAVINESS = 1 - 1e-6
 # The steps fit the order if the last change by a smaller step, divided by what the order
 # foretells from the change before, is between these. (An order less by a half makes this
 # ratio 1.41, and an order more by two 0.25.)
 _LEAST_RATIO = 0.25
 _LARGEST_RATIO = 1.33
 # The last change may be outside that range by this many standard errors.
-_ERRORS_BY_CHANCE = 2
+_STD_ERRORS_BY_CHANCE = 2
 
 
 def heaviness(largest: Any, s: Any, n: Any, numpy: Any = np) -> Any:
     """The `r` of `Expectation.std_error`, which measures how heavy the tails of `n` values
     are, from their largest deviation and their standard deviation `s`. `numpy` is NumPy or
     `jax.numpy`. Not finite if `s` is zero."""
-    largest_of_normal = s * numpy.sqrt(_OUTLYING * numpy.log(numpy.maximum(n, 2)))
+    largest_of_normal = s * numpy.sqrt(_SQUARE_PER_LOG * numpy.log(numpy.maximum(n, 2)))
     return numpy.maximum(largest - largest_of_normal, 0) / (s * numpy.sqrt(n))
 
 
 def share_of_largest(r: Any, n: int) -> Any:
-    """The share of the sum of squared deviations of `n` values that is that of the largest
-    alone, from their `heaviness`, which must not be zero."""
-    return np.minimum((r + np.sqrt(_OUTLYING * np.log(max(n, 2)) / n)) ** 2, 1)
+    """The share of the largest deviation in the sum of squared deviations of `n` values,
+    from their `heaviness` `r`, which must not be zero."""
+    # The formula of `heaviness`, solved for `largest`, squared and divided by `n s^2`.
+    return np.minimum((r + np.sqrt(_SQUARE_PER_LOG * np.log(max(n, 2)) / n)) ** 2, 1)
 
 
 def least_deviation(largest: Any, r: Any, n: int) -> Any:
     """The standard deviation of `n` values, from their largest deviation and their
-    `heaviness`; if that is zero, the least that it can be."""
-    return largest / (r * np.sqrt(n) + np.sqrt(_OUTLYING * np.log(max(n, 2))))
+    `heaviness` `r`; or where `r` is zero, a lower bound of it."""
+    # The formula of `heaviness`, solved for `s`.
+    return largest / (r * np.sqrt(n) + np.sqrt(_SQUARE_PER_LOG * np.log(max(n, 2))))
 
 
 class Results(NamedTuple):
@@ -60,8 +62,8 @@ class Results(NamedTuple):
     - `plain_s`: the standard deviation of a sample without a control variate.
     - `heaviness`: the `r` of `Expectation.std_error`.
     - `dropped`: whether a control variate was dropped because its mean is not zero.
-    - `spread`: the largest deviation of a path's value from the mean, without control. (For
-        replicates, that is the mean over the replicates.)
+    - `spread`: the largest deviation of a path's value from the mean, without a control
+        variate. (For replicates it is averaged over them.)
     """
 
     mean: np.ndarray
@@ -85,7 +87,8 @@ def results_of(moments: Moments, dtype: str, rounding_floor: int) -> Results:
     n = moments.num_good
     mean = moments.mean
     plain_mean = mean.without_control
-    # The best combination comes first. All others are differences of values of its size.
+    # The first combination of levels is the best one. The others are differences of numbers
+    # of its size, so all have rounding errors of the same size.
     size = np.fmax(np.abs(mean.value[:1]), np.abs(plain_mean[:1]))
     rounding = rounding_floor * float(jnp.finfo(dtype).eps) * size
     value_spread = _spread_of(
@@ -120,7 +123,9 @@ def _results_with_control(
         n, rounding, moments.norm.control, moments.largest.control
     )
     plain_spread = _spread_of(n, rounding, moments.norm.plain, moments.largest.plain)
-    allowed = np.fmax(_SURE_OF_CONTROL * control_spread.std_error, ROUNDING * rounding)
+    allowed = np.fmax(
+        _STD_ERRORS_TO_DROP * control_spread.std_error, ROUNDING * rounding
+    )
     mean_may_be_zero = np.abs(mean.control) <= allowed
     # With heavy tails the standard error in `allowed` is not reliable.
     has_heavy_tails = control_spread.r > _HEAVY_CONTROL
@@ -162,12 +167,11 @@ def _spread_of(
     `Expectation.std_error`. If each value is a mean over paths, which hides the tails of
     these, `r_of_paths` is the `heaviness` of the paths."""
     s = norm / np.sqrt(n - 1) if n > 1 else np.full_like(norm, np.nan)
-    r = np.where(s > 0, heaviness(largest, s, n), 0)
-    # Rounding errors can have heavy tails, too.
-    r = np.where(largest > ROUNDING * rounding, r, 0)
-    if r_of_paths is not None:
-        r = np.fmax(r, r_of_paths)
-    r = np.minimum(r, _MOST_HEAVY)
+    # Deviations that are rounding errors can have heavy tails, too, which do not count.
+    is_random = (s > 0) & (largest > ROUNDING * rounding)
+    r_of_values = np.where(is_random, heaviness(largest, s, n), 0)
+    larger_r = r_of_values if r_of_paths is None else np.fmax(r_of_values, r_of_paths)
+    r = np.minimum(larger_r, _LARGEST_HEAVINESS)
     std_error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
     return _Spread(s, r, np.maximum(std_error, rounding))
 
@@ -178,9 +182,10 @@ def is_off_order(last: Any, miss: Any, miss_error: Any) -> np.ndarray:
     `miss` is this change minus what the order foretells from the change before, and
     `miss_error` its standard error."""
     prediction = last - miss
-    # Where the prediction is negative, the largest ratio gives the lower end.
+    # The ends of the range of changes that fit. The second is the lower one where the
+    # prediction is negative.
     ends = np.stack([_LEAST_RATIO * prediction, _LARGEST_RATIO * prediction])
-    allowance = _ERRORS_BY_CHANCE * miss_error
+    allowance = _STD_ERRORS_BY_CHANCE * miss_error
     low = np.min(ends, axis=0) - allowance
     high = np.max(ends, axis=0) + allowance
     return (last < low) | (last > high)
@@ -191,19 +196,20 @@ def remaining_error(
 ) -> np.ndarray | np.floating:
     """An estimate of the discretization error that remains after the last extrapolation.
 
-    It is the larger of two: the `change` by this extrapolation, and the change that it
-    would make if it eliminated the first power of the step size only, as far as this is
-    more than its noise, by its `std_error`."""
-    # By the former alone, of harmonic oscillators over long times by four and five levels,
-    # 5 to 12% of the means were more than two error bars off; by both it is 0 to 2%.
-    least_change = np.abs(change_by_first_power) - _ERRORS_BY_CHANCE * std_error
+    It is the larger of two numbers: the size of the `change` by this extrapolation, and
+    that of the change that it would make if it eliminated the first power of the step size
+    only, less two standard errors, `std_error`, of this second change."""
+    # With `change` alone, 5 to 12% of the means of harmonic oscillators over long times, by
+    # four and five levels, were more than two error bars off. With both it is 0 to 2%.
+    least_change = np.abs(change_by_first_power) - _STD_ERRORS_BY_CHANCE * std_error
     return np.maximum(np.abs(change), least_change)
 
 
 def largest_if_off_order(
     off_order: Any, size: Any, last: Any, before: Any
 ) -> np.ndarray:
-    """The `size` of the error that remains, or where the changes do not fit the order, the
-    largest among it, the `last` change by a smaller step and the change `before`."""
+    """The `size` of the error that remains; or where the changes do not fit the order, the
+    largest of this size and those of the `last` change by a smaller step and of the change
+    `before` that one."""
     largest_change = np.maximum(np.abs(last), np.abs(before))
     return np.where(off_order, np.maximum(size, largest_change), size)

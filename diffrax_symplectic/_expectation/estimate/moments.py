@@ -78,13 +78,13 @@ def _moments_of_both(a: Moments, b: Moments) -> Moments:
     [Chan, Golub and LeVeque (1983)](https://doi.org/10.1080/00031305.1983.10483115)."""
     n = max(a.num_good + b.num_good, 1)
     share_of_b = b.num_good / n
-    # The squared deviations of both are the sum of those of `a` and `b`, and of the squared
-    # difference of their means times `a.num_good * b.num_good / n`.
+    # The sum of squared deviations of all samples is that of `a`, plus that of `b`, plus
+    # `weight**2` times the squared difference of their means.
     weight = np.sqrt(a.num_good / n * b.num_good)
     difference = jtu.tree_map(np.subtract, b.mean, a.mean)
 
     def mean(of_a, of_b, difference):
-        # The mean of no samples is a placeholder.
+        # Without samples the mean of `a` is a placeholder.
         return of_b if a.num_good == 0 else of_a + difference * share_of_b
 
     def norm(of_a, of_b, difference):

@@ -143,7 +143,7 @@ def fields_from(contents: Contents) -> dict[str, Any]:
     _check_counts(header)
     layout = Layout.of(_tree_of(header["structure"]), header["num_times"])
     levels = _num_levels(header)
-    # From three levels on, the combinations are the same.
+    # More levels than three have no further combinations.
     num_combinations = len(level_weights(1, min(levels, 3)))
     _check(bool(jnp.finfo(header["dtype"])))
     _check(arrays["key_data"].dtype == np.uint32)
@@ -213,9 +213,10 @@ def _num_levels(header: dict[str, Any]) -> int:
     return len(failed_on)
 
 
-def _check(is_so: bool) -> None:
-    """Raises a `ValueError` unless this is so."""
-    if not is_so:
+def _check(condition: bool) -> None:
+    """Raises a `ValueError` unless the condition holds. It needs no message: `load` says
+    that the file is damaged."""
+    if not condition:
         raise ValueError
 
 
@@ -242,7 +243,7 @@ def _sampling_from(header: dict[str, Any]) -> Any:
 
 
 def _is_plain(x: Any) -> bool:
-    """Whether JSON takes this value, from `_number_for_json`."""
+    """Whether JSON takes this value once `_number_for_json` has converted it."""
     return x is None or isinstance(x, int | float | str | np.integer)
 
 

@@ -6,16 +6,16 @@ from ..._simulation import Combination
 from .estimate import combined_results, Expectation
 
 
-# More samples are of no use once the standard error is at most this share of the tolerance:
-# without it an error as large as the tolerance would be less by about an eighth at
-# most.
-_SHARE_OF_SAMPLING = 0.5
-# The same without a tolerance, for the share of the discretization error: then the sampling
-# error is a half percent of the whole.
-_SHARE_BESIDE_STEPS = 0.1
+# More samples are of no use once the standard error is at most this share of the tolerance,
+# but the whole error is still larger. Since squares are added, an error as large as the
+# tolerance would then be less by about an eighth without sampling.
+_SHARE_OF_TOLERANCE = 0.5
+# Without a tolerance, they are of no use once the standard error is at most this share of
+# the discretization error: the whole error is then larger than that by half a percent.
+_SHARE_OF_DISCRETIZATION = 0.1
 # What remains of the discretization error is known up to noise. By chance it exceeds the
 # tolerance by this many of its standard errors once in fifty times.
-_ERRORS_BY_CHANCE = 2
+_STD_ERRORS_BY_CHANCE = 2
 
 
 def is_reached(estimate: Expectation, tol: float) -> bool:
@@ -31,7 +31,7 @@ def is_stuck(estimate: Expectation, tol: float) -> bool:
         return True
     # If the standard error is small, the rest of the error comes from the step or from
     # failed paths.
-    has_enough_samples = _all_within(vectors.std_error, _SHARE_OF_SAMPLING * tol)
+    has_enough_samples = _all_within(vectors.std_error, _SHARE_OF_TOLERANCE * tol)
     return has_enough_samples and not _all_within(vectors.error, tol)
 
 
@@ -42,7 +42,9 @@ def is_bounded_by_steps(estimate: Expectation) -> bool:
     if vectors.discretization_error is None or estimate.num_failed > 0:
         return False
     return bool(
-        np.all(vectors.std_error <= _SHARE_BESIDE_STEPS * vectors.discretization_error)
+        np.all(
+            vectors.std_error <= _SHARE_OF_DISCRETIZATION * vectors.discretization_error
+        )
     )
 
 
@@ -54,9 +56,10 @@ def needs_level(estimate: Expectation, tol: float) -> bool:
 
 
 def share_of_needed(estimate: Expectation, tol: float | None) -> float:
-    """The estimated share of the samples needed that has been taken."""
+    """The estimated share of the needed samples that have been taken, from 0 to 1."""
     if tol is None or estimate.num_samples < 2:
         return 0.0
+    # At least `tol`, so that the share is at most one.
     std_error = max(largest_error(estimate.vectors.std_error), tol)
     # The standard error decreases like one over the square root of the number of samples.
     return (tol / std_error) ** 2 if np.isfinite(std_error) else 0.0
@@ -84,10 +87,11 @@ def shortfall(estimate: Expectation, tol: float) -> str:
             f"{discretization:.1e} remains of the discretization error with "
             f"{estimate.levels} levels. Pass a smaller `dt0`, or more `levels`"
         )
-    # What the other parts of the error leave of the tolerance, at least a tenth.
     others = np.hypot(discretization, failed_error)
-    # The square of a small tolerance would underflow.
-    allowed = max(np.sqrt(max(tol - others, 0.0)) * np.sqrt(tol + others), tol / 10)
+    # What the other parts of the error leave for sampling, `sqrt(tol**2 - others**2)`, in
+    # factors, since the square of a small tolerance would underflow.
+    left_for_sampling = np.sqrt(max(tol - others, 0.0)) * np.sqrt(tol + others)
+    allowed = max(left_for_sampling, tol / 10)
     ratio = sampling_error / float(allowed)
     needed_paths = estimate.num_paths * ratio * ratio
     return (
@@ -113,4 +117,4 @@ def _is_discretization_beyond(estimate: Expectation, tol: float) -> bool:
         return False
     # The discretization error is the change by the last extrapolation.
     noise = combined_results(estimate, Combination.EXTRAPOLATION).std_error
-    return bool(np.any(error - _ERRORS_BY_CHANCE * noise > tol))
+    return bool(np.any(error - _STD_ERRORS_BY_CHANCE * noise > tol))

@@ -149,13 +149,15 @@ def _samples_of(
     value = combinations(problem.weights, plain - control)
     plain = combinations(problem.weights, plain)
 
-    # The random variables of all levels are drawn independently, so ratios are multiplied.
-    weights = mixture.weights(jnp.sum(simulated.control.log_ratios, axis=0))
-    # A path that fails by another law is rare by its own, of which other paths tell. It
-    # counts as one without a deviation.
+    # The levels draw their random variables independently, so that their likelihood ratios
+    # are multiplied.
+    ratios = mixture.weights(jnp.sum(simulated.control.log_ratios, axis=0))
+    # A failed path has the weight zero, and then the mean of the others for a value. If it
+    # drew by another law than its own (number 0), it still counts as a good sample: such
+    # paths are rare by their own law, by which other paths show how many fail.
     has_failed = jnp.any(simulated.failed, axis=0)
     has_own_law = laws == 0
-    weights = jnp.where(has_failed, 0, weights).astype(plain.dtype)
+    weights = jnp.where(has_failed, 0, ratios).astype(plain.dtype)
     value = _weighted(weights, value)
     plain = _weighted(weights, plain)
     return Samples(
@@ -169,16 +171,16 @@ def _samples_of(
 def _weighted(
     weights: Float[Array, " n"], value: Float[Array, "combinations n numbers"]
 ) -> Float[Array, "combinations n numbers"]:
-    """Values of which the mean is that of the weighted ones. The values of paths without
-    weight, which may have failed, do not matter."""
-    weights = weights[:, None]
-    shares = weights / jnp.sum(weights)
-    weighted = jnp.where(shares > 0, shares * value, 0)
-    mean_of_others = (jnp.sum(weighted, axis=1, keepdims=True) - weighted) / (
-        1 - shares
-    )
-    mean_of_others = jnp.where(shares < 1, mean_of_others, 0)
-    # The mean of a weight is one, and independent of the other paths. So only deviations
-    # from their mean are weighted, which vary less.
-    deviations = jnp.where(weights > 0, weights * (value - mean_of_others), 0)
+    """For each path `m + w (x - m)`, with its weight `w`, its value `x` and the weighted
+    mean `m` of the other paths: the expectation is that of `w x`, since `w` has the mean
+    one and is independent of `m`; but it varies less. Where `w` is zero, `x` does not
+    matter, and need not be finite."""
+    # (n, 1)
+    column = weights[:, None]
+    shares = column / jnp.sum(column)
+    parts = jnp.where(shares > 0, shares * value, 0)
+    sum_of_others = jnp.sum(parts, axis=1, keepdims=True) - parts
+    # A single path with all of the weight has no others.
+    mean_of_others = jnp.where(shares < 1, sum_of_others / (1 - shares), 0)
+    deviations = jnp.where(column > 0, column * (value - mean_of_others), 0)
     return mean_of_others + deviations

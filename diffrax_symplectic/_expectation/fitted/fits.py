@@ -83,7 +83,7 @@ class FittedFunctions(eqx.Module):
 def fit(
     noise: Noise, key: PRNGKeyArray, basis: AbstractBasis
 ) -> tuple[FittedFunctions, Int[Array, ""]]:
-    """The functions of a level, by a pilot run step_all in time and fits backward; and how
+    """The functions of a level, by a pilot run forward in time and fits backward; and how
     many of the pilot's paths failed."""
     problem = noise.problem
     num_steps = noise.level.num_steps
@@ -135,15 +135,16 @@ def fit(
 
 
 def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
-    """What the functions after step `i` are fitted to, as a function of a flat state. For
-    averages at the end of this step that is `phi` itself, for later ones the mean over the
-    next step of the functions after it, which are known, and for earlier ones zero. A
-    random key, if there is one, serves to estimate this mean where a step has many
-    outcomes."""
+    """What the functions after step `i` are fitted to, as a function of a flat state and
+    maybe a random key. For averages at the end of this step that is `phi` itself; for later
+    times the mean, over the outcomes of the next step, of the functions after that one,
+    which are already fitted; and for earlier times zero. If a step has many outcomes, a key
+    serves to estimate the mean from a draw."""
     problem = noise.problem
     level = noise.level
     _, unravel = jfu.ravel_pytree(problem.y0)
-    # After the last step the mean over a next one is computed, too, but not used.
+    # There is no step after the last one. The mean is then computed over the last step
+    # itself, and not used: no time at which to average is later.
     next_step = jnp.minimum(i + 1, level.num_steps - 1)
 
     def value(flat_y: Float[Array, " d"], key: PRNGKeyArray | None = None) -> Array:

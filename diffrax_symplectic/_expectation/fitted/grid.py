@@ -21,11 +21,12 @@ from .bases import AbstractBasis, CovarianceFrame, Hermite
 # with a width of 1.05, where paths leave the grid, and 3e-9 with one of 2.5, where its
 # points are far apart.
 _WIDTH_PER_RANGE = 1.5
-# The fraction of the width at which the values start to fall to zero (with 0.6 the standard
-# error of the pendulum was 2e-7), and the fraction of that fraction beyond which points are
-# near the edge, where the polynomials are compared.
+# The coordinate, from 0 in the middle to 1 at the edge, at which the correction starts to
+# fall to zero. (With 0.6 the standard error of the pendulum was 2e-7.)
 _START_OF_FALL = 0.9
-_START_OF_EDGE = 0.8
+# Points between this coordinate and the start of the fall are near the edge: there the
+# polynomials are compared.
+_START_NEAR_EDGE = 0.8 * _START_OF_FALL
 # The interpolation points along each axis: polynomials of degree 5. With 4 points the
 # standard error of the pendulum was 4e-8, with 8 it was 7e-12 to 5e-10.
 _STENCIL = 6
@@ -188,23 +189,25 @@ class Grid(AbstractBasis):
         self, x: Float[Array, " d"], c: Float[Array, "nodes ..."]
     ) -> Float[Array, "..."]:
         """The values on the grid, interpolated at a point, and zero beyond the grid."""
+        # The number of grid points along each axis.
         n = self.candidates[0]
         value_shape = c.shape[1:]
         # The number of interpolation points on each side of the point.
         half = _STENCIL // 2
-        # The coordinates of the point, in spacings of the grid from its first point.
-        place = (x + 1) * (n - 1) / 2
-        # Whether that many points of the grid lie on each side.
-        is_inside = jnp.all((place >= half - 1) & (place <= n - half))
-        # Outside, the result at some place inside is computed, and dropped.
-        place = jnp.where(is_inside, place, n / 2)
+        # The point in units of the spacing, from the first grid point along each axis.
+        position = (x + 1) * (n - 1) / 2
+        # Whether `half` grid points lie on each side, along each axis.
+        is_inside = jnp.all((position >= half - 1) & (position <= n - half))
+        # Outside, the result at some point inside is computed, and dropped.
+        safe_position = jnp.where(is_inside, position, n / 2)
         # The first interpolation point along each axis.
-        begin = jnp.minimum(jnp.floor(place) - (half - 1), n - _STENCIL)
+        begin = jnp.minimum(jnp.floor(safe_position) - (half - 1), n - _STENCIL)
         start_indices = jnp.pad(begin.astype(jnp.int32), (0, len(value_shape)))
         values_on_grid = c.reshape(*[n] * self.d, *value_shape)
         block_shape = *[_STENCIL] * self.d, *value_shape
         block = lax.dynamic_slice(values_on_grid, start_indices, block_shape)
-        weights = _lagrange_polynomials([place - begin - j for j in range(_STENCIL)])
+        distances = [safe_position - begin - j for j in range(_STENCIL)]
+        weights = _lagrange_polynomials(distances)
         # Each pass sums over the leading axis, which is the next axis of the grid.
         for axis in range(self.d):
             products = [weight[axis] * row for weight, row in zip(weights, block)]
@@ -218,8 +221,7 @@ def _best_degree_near_edge(
     """The index of the degree that leaves the least near the edge of the grid, for each
     time and component. `x` are the coordinates of the nodes."""
     distance = np.max(np.abs(x), axis=1)
-    is_beyond_middle = distance > _START_OF_FALL * _START_OF_EDGE
-    is_near_edge = is_beyond_middle & (distance < _START_OF_FALL)
+    is_near_edge = (distance > _START_NEAR_EDGE) & (distance < _START_OF_FALL)
     largest_residual = jnp.max(jnp.abs(residual[is_near_edge]), axis=0)
     return jnp.argmin(largest_residual, axis=0)[None, None]
 

@@ -34,15 +34,16 @@ _SHARE_OF_OTHERS = 1 / 2
 # nats. Typical paths of the changed noise are then e^4 = 55 times less likely by their own
 # law. (With 8 nats the standard errors were 1.1 times larger.)
 _NATS = 4.0
-# With this tilt the largest of three outcomes, sqrt(3) times as large as the standard
-# deviation, is e^7 = 1,000 times as likely next to the middle one as before: nearly all
-# outcomes are the largest.
-_MOST_TILTED = 4.0
+# The largest tilt. It multiplies the probability of the largest of three outcomes, sqrt(3)
+# standard deviations, by e^(4 sqrt(3)) = 1,000 relative to that of the middle one, zero:
+# nearly all outcomes are then the largest.
+_MOST_TILT = 4.0
 # The bisection halves its interval this many times, after which only rounding errors in
 # single precision remain.
 _HALVINGS = 30
-# The most noises that push paths to all sides: each further one doubles the laws.
-_MOST_NOISES = 2
+# With at most this many noises there is a law for each way to push each of them to one side
+# or the other. Each further noise would double the number of laws.
+_MOST_NOISES_PUSHED = 2
 
 # Maps a law and the strength of a change to the probabilities that the law has after it.
 _ChangeOfLaw: TypeAlias = Callable[[Discrete, float], np.ndarray]
@@ -53,7 +54,8 @@ class Mixture(eqx.Module):
 
     - `shares`: the probability with which a path draws by each law.
     - `cuts_of_laws`: the cuts between the random words that choose the laws.
-    - `cuts`: those of `Noise.draw`, for each level and law.
+    - `cuts`: the cuts between the random words that choose outcomes, as for `Noise.draw`,
+        for each level and law.
     - `log_ratios`: for each level, law and random variable the logarithm of the probability
         of each outcome by the law, divided by that by the own law.
     """
@@ -69,13 +71,13 @@ class Mixture(eqx.Module):
         noise pushes to one side, in the order of `itertools.product`."""
         laws = Noise.of(problem, problem.level(0)).laws
         own = [np.array(law.probabilities) for law in laws]
-        # With the share 1 all outcomes are equally probable.
+        # For each level. With a width of 1 all outcomes are equally probable.
         widths = _strongest_change(problem, laws, _widened, most=1.0)
-        # For each level and other law, the probabilities of each variable's outcomes.
+        # By level, other law and variable: arrays of the probabilities of outcomes.
         others = [[[_widened(law, width) for law in laws]] for width in widths]
         num_noises = number_of_noises(problem.terms)
-        if num_noises <= _MOST_NOISES:
-            tilts = _strongest_change(problem, laws, _tilted, most=_MOST_TILTED)
+        if num_noises <= _MOST_NOISES_PUSHED:
+            tilts = _strongest_change(problem, laws, _tilted, most=_MOST_TILT)
             # The increments come first. The other variables, which are only in products
             # with them, are not tilted.
             not_tilted = [0] * (len(laws) - num_noises)
@@ -112,7 +114,8 @@ class Mixture(eqx.Module):
 
     def draw_law(self, key: PRNGKeyArray) -> Int[Array, ""]:
         """The number of the law by which the path with this key draws, on all levels."""
-        # No level has this number, so these words are not those of a step.
+        # In place of the numbers of a draw and of a level. No level has this number, so the
+        # noise of steps has other words.
         place = jnp.array(0), jnp.array(len(self.cuts))
         (words,) = random_words(key, place, 1, 1)
         return jnp.sum(words >= self.cuts_of_laws)
@@ -134,11 +137,11 @@ def log_ratios_of_outcomes(
     return jnp.sum(jnp.where(has_outcome, log_ratios, 0), axis=(1, 2))
 
 
-def _widened(law: Discrete, share: float) -> np.ndarray:
-    """Probabilities between those of the law (for a `share` of zero) and equal ones (for
-    one)."""
+def _widened(law: Discrete, width: float) -> np.ndarray:
+    """The law's probabilities for a `width` of 0, equal ones for 1, and averages of both in
+    between."""
     own = np.array(law.probabilities)
-    return (1 - share) * own + share / len(own)
+    return (1 - width) * own + width / len(own)
 
 
 def _tilted(law: Discrete, tilt: float) -> np.ndarray:

@@ -102,15 +102,16 @@ class Noise(eqx.Module):
         cuts: UInt32[Array | np.ndarray, "n cuts"],
     ) -> tuple[Float[Array, " n"], Bool[Array, "n outcomes"]]:
         """The variables `x` drawn from the key and this index, and which outcomes they
-        have. The number of the outcome of a variable is the number of its `cuts`, as from
-        `cuts_of`, that are not above its random word."""
+        have. A variable has outcome `k` if its random word is not below `k` of its `cuts`,
+        as from `cuts_of`, and below all others."""
         place = draw_index, jnp.asarray(self.level.index)
         # One random word for each variable, from a single block of words.
         words = random_words(key, place, 1, len(self.laws))[0]
-        numbers = jnp.sum(words[:, None] >= cuts, axis=1)
+        outcome_numbers = jnp.sum(words[:, None] >= cuts, axis=1)
+        # (n, outcomes)
         values = padded([np.array(law.values) for law in self.laws])
         _, num_outcomes = values.shape
-        has_outcome = numbers[:, None] == np.arange(num_outcomes)
+        has_outcome = outcome_numbers[:, None] == np.arange(num_outcomes)
         values = values.astype(self.problem.dtype)
         return jnp.sum(jnp.where(has_outcome, values, 0), axis=1), has_outcome
 
@@ -277,11 +278,13 @@ def cuts_by(
 
 
 def _padded_cuts(rows: Sequence[np.ndarray]) -> UInt32[np.ndarray, "n cuts"]:
+    """Rows of cuts as one array. Shorter rows are padded with the largest word, and cuts of
+    2^32, which is no word, are replaced by it. (The one random word that reaches this cut
+    has the number of an outcome past the last, which `padded` makes equal to the last.)"""
     most = max(map(len, rows))
-    # Words are whole numbers, and none is above this one.
-    last = np.iinfo(np.uint32).max
-    cuts = [np.pad(x, (0, most - len(x)), constant_values=last) for x in rows]
-    return np.minimum(np.stack(cuts), last).astype(np.uint32)
+    largest_word = np.iinfo(np.uint32).max
+    cuts = [np.pad(x, (0, most - len(x)), constant_values=largest_word) for x in rows]
+    return np.minimum(np.stack(cuts), largest_word).astype(np.uint32)
 
 
 def padded(rows: Sequence[np.ndarray]) -> np.ndarray:

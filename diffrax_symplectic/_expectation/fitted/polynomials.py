@@ -12,11 +12,12 @@ from jaxtyping import Array, Float
 from ..._products import dot
 
 
-# The normal equations have the squared condition number of a fit. This many roundings are
-# added to their diagonal, so that they have a Cholesky factor. Along an axis with the
-# eigenvalue s, each refinement multiplies what this changes in the solution by r / (s + r),
-# with r what was added.
-_RIDGE = 1e4
+# The normal equations have the square of the condition number of a fit, and rounding might
+# leave them without a Cholesky factor. So a ridge of this many roundings is added to their
+# diagonal.
+_ROUNDINGS_IN_RIDGE = 1e4
+# How often the solution is refined. Along an axis with the eigenvalue s, each refinement
+# multiplies the error that a ridge of size r causes by r / (s + r).
 _REFINEMENTS = 3
 
 
@@ -77,14 +78,15 @@ def least_squares(
     # Columns are scaled to length one, so that one ridge suits all.
     lengths = jnp.sqrt(jnp.sum(B**2, axis=0))
     lengths = jnp.where(lengths > 0, lengths, 1)
-    B = B / lengths
+    scaled_B = B / lengths
     _, num_columns = B.shape
-    ridge = _RIDGE * jnp.finfo(B.dtype).eps * jnp.eye(num_columns, dtype=B.dtype)
-    L = jnp.linalg.cholesky(dot(B.T, B) + ridge)
+    ridge = _ROUNDINGS_IN_RIDGE * jnp.finfo(B.dtype).eps
+    ridge_matrix = ridge * jnp.eye(num_columns, dtype=B.dtype)
+    L = jnp.linalg.cholesky(dot(scaled_B.T, scaled_B) + ridge_matrix)
 
-    # A leading block of the Cholesky factor is the factor of a leading block of the normal
-    # equations. So one factorization serves all fits: the rest of each factor is the
-    # identity.
+    # A fit with fewer polynomials has a leading block of the normal equations, and its
+    # Cholesky factor is the leading block of `L`. So one factorization serves all fits. The
+    # rest of each factor is filled with the identity, so that all have the same shape.
     # (C, P)
     is_used = np.arange(num_columns) < np.array(sizes)[:, None]
     # (C, P, P)
@@ -97,14 +99,15 @@ def least_squares(
         return jax.scipy.linalg.cho_solve((L, True), rhs)
 
     def refine(_, c: Float[Array, "C P m"]) -> Float[Array, "C P m"]:
-        residual = jnp.moveaxis(values, 1, 0) - dot(B, c)
-        rhs = jnp.where(is_used[:, :, None], dot(B.T, residual), 0)
+        # (C, n, m)
+        residual = jnp.moveaxis(values, 1, 0) - dot(scaled_B, c)
+        rhs = jnp.where(is_used[:, :, None], dot(scaled_B.T, residual), 0)
         return c + jax.vmap(solution)(factors, rhs)
 
-    c = jnp.zeros((len(sizes), num_columns, values.shape[2]), values.dtype)
+    no_fit = jnp.zeros((len(sizes), num_columns, values.shape[2]), values.dtype)
     # The first refinement, which starts from zero, gives the solution itself.
-    c = jax.lax.fori_loop(0, _REFINEMENTS, refine, c)
+    c = jax.lax.fori_loop(0, _REFINEMENTS, refine, no_fit)
     # (P, C, m)
     c = jnp.moveaxis(c, 0, 1)
-    # From the scaled polynomials to those of the caller.
+    # From the coefficients of the scaled polynomials to those of the caller's.
     return c / lengths[:, None, None]

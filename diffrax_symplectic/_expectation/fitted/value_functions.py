@@ -138,7 +138,8 @@ class ValueFunctions(AbstractSampling):
                 "used. Pass another `degree`, or another `sampling`.",
                 stacklevel=_FRAMES_TO_USER,
             )
-        # Where paths fail, those of wider laws fail far more often, and tell nothing.
+        # If paths fail, those of the other laws, which go further out, fail far more often,
+        # and show nothing of the rare paths for which they are there.
         some_fail = any(trial.num_failed > 0 for trial in trials_of_candidates)
         if some_fail or not np.any(choice.used):
             mixture = mixture.own_law_alone()
@@ -154,7 +155,7 @@ class ValueFunctions(AbstractSampling):
 
 def _with_half_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
     """A plan of `ValueFunctions` with half the steps on all levels. Only the last level is
-    fitted: the others have had their steps already."""
+    fitted: each other level now has the steps of the one after it, and takes its fit."""
     problem, functions, *others = plan.sampler.args  # pyright: ignore (a `Partial`)
     finer_problem = problem.with_half_steps()
     last_level = len(problem.levels.h) - 1
@@ -206,7 +207,7 @@ def _comparison(
     # The trials have the same paths, so without control their results are the same.
     first, *_ = results_of_candidates
     plain_errors = first.plain_std_error.reshape(output_shape)
-    # A fit is used where the error without it is NaN, too.
+    # Written as a negation, so that a fit is used if the error without it is NaN.
     is_no_better = least_errors >= plain_errors
     return _Comparison(
         choice=Choice(best=np.argmin(errors, axis=0), used=~is_no_better),
@@ -219,7 +220,7 @@ def _comparison(
 def _reason(basis: AbstractBasis, choice: Choice) -> str:
     """Which candidates were chosen, with zero for none, such as
     `degree: 2, 4, chosen among 0, 2, 4`."""
-    # A candidate comes one place later here, behind the zero.
+    # Zero stands for no control variate, so candidate `k` is option `k + 1`.
     options = np.array([0, *basis.candidates])
     chosen = np.unique(options[np.where(choice.used, choice.best + 1, 0)])
     return (

@@ -69,7 +69,7 @@ def _warn_of_many_coordinates(
 ) -> None:
     """Warns if paths that are sorted by so many coordinates are far from their
     neighbours."""
-    # If the paths fill a cube.
+    # If the paths fill a cube, with equal distances along all coordinates.
     num_along_coordinate = num_paths ** (1 / num_coordinates)
     if num_along_coordinate < _FEWEST_ALONG_COORDINATE:
         most_coordinates = int(math.log(num_paths, _FEWEST_ALONG_COORDINATE))
@@ -194,24 +194,24 @@ def _samples_of_replicate(
         return Motion(step, motion.start)
 
     simulated = simulate(problem, motion_on, _statistics)
-    # From (levels, S, 3, m) to (3, levels, S, n, m), with an axis for the samples, of which
-    # there is one.
+    # From (levels, S, 3, m), with the three numbers of `_statistics`, to (3, levels, S, 1,
+    # m), with an axis for the only sample.
     statistics = jnp.moveaxis(simulated.saved[:, :, :, None], 2, 0)
-    # (levels, n, numbers)
-    mean, r, largest = map(as_vectors, statistics)
-    mean = combinations(problem.weights, mean)
+    # (levels, 1, numbers)
+    mean_on_levels, r, largest = map(as_vectors, statistics)
+    mean = combinations(problem.weights, mean_on_levels)
     averaged = Averaged(
         mean,
         # The largest `r` on any level, for all combinations.
         heaviness=jnp.broadcast_to(jnp.max(r, axis=0), mean.shape),
-        # The most by which a path can deviate in a combination of levels: the largest
-        # deviations on all of them may be deviations of one path.
+        # An upper bound of how far a path deviates in a combination of levels, which is
+        # reached if one path has the largest deviation on all of them.
         largest=combinations(abs(problem.weights), largest),
     )
     num_failed = jnp.sum(simulated.failed, axis=1, keepdims=True)
-    # Of no paths there is no mean.
-    has_paths = jnp.all(num_failed < n, axis=0)
-    return Samples(averaged, good=has_paths, num_failed=num_failed)
+    # A level on which all paths fail has no mean.
+    has_mean = jnp.all(num_failed < n, axis=0)
+    return Samples(averaged, good=has_mean, num_failed=num_failed)
 
 
 def _words_of_paths(
@@ -226,8 +226,8 @@ def _words_of_paths(
     key = jr.fold_in(jr.fold_in(replicate_key, level.index), i)
     _, d = points.shape
     seeds = jr.bits(key, (num_seeds(d),), jnp.uint32)
-    # Its outer values have probability one sixth, for which a power of two of points is not
-    # balanced.
+    # The outer values of this variable have probability 1/6 each, but a sixth of a power of
+    # two of points is not a whole number.
     if layout.is_one_three_point_variable:
         return balanced_in_sixths(points, seeds)
     return scrambled(points, seeds)
@@ -263,7 +263,7 @@ def _statistics(phi: Float[Array, "n m"], failed: Bool[Array, " n"]) -> Array:
     # squares neither overflow nor underflow.
     scaled = deviations / jnp.where(largest > 0, largest, 1)
     s = jnp.sqrt(mean_of_good(scaled**2))
-    # Rounding errors can have heavy tails, too.
+    # Deviations that are rounding errors can have heavy tails, too, which do not count.
     is_random = largest > ROUNDING * jnp.finfo(phi.dtype).eps * jnp.abs(mean)
     r = jnp.where(is_random, heaviness(1, s, num_good, jnp), 0)
     return jnp.stack([mean, r, largest])

@@ -12,9 +12,8 @@ from jaxtyping import Array, Bool, Float, Int32, UInt, UInt32
 # The most bits of a coordinate that sorting uses: 16 bits are 65,536 cells along each axis,
 # four times the default number of paths. Each bit costs some operations on all paths.
 _COORDINATE_BITS = 16
-# About how many states the range of a coordinate is estimated from, and the share of them
-# that is left out at either end. The range need not be accurate: the grid is three times as
-# wide.
+# The range of a coordinate is estimated from about this many states, of which this share is
+# left out at either end. It need not be accurate, since the grid is three times as wide.
 _SAMPLE_SIZE = 256
 _SHARE_OF_OUTLIERS = 1 / 50
 # The bits of an unsigned integer of 64 or 32 bits, less the highest, which marks the rows
@@ -80,17 +79,19 @@ def _cells(z: Float[Array, "n d"], total_bits: int) -> list[UInt32[Array, " n"]]
     d = min(num_coordinates, total_bits)
     bits = _bits_of_coordinate(d, total_bits)
     z = jnp.nan_to_num(z[:, :d])
-    # Each so many of the states, each coordinate sorted by itself.
-    sample = jnp.sort(z[:: max(1, n // _SAMPLE_SIZE)], axis=0)
+    # Some states at equal distances in `z`, of which each coordinate is sorted by itself.
+    stride = max(1, n // _SAMPLE_SIZE)
+    sample = jnp.sort(z[::stride], axis=0)
     num_outliers = int(len(sample) * _SHARE_OF_OUTLIERS)
     low = sample[num_outliers]
     high = sample[-1 - num_outliers]
     width = jnp.where(high > low, high - low, 1)
-    # The place in the grid, in thirds of the grid: from 1 to 2 between `low` and `high`.
+    # The distance from the lower edge of the grid, in thirds of the grid: 1 at `low`, and 2
+    # at `high`.
     thirds = (z - low) / width + 1
-    cells = thirds * np.asarray(2.0**bits / 3, z.dtype)
+    positions = thirds * np.asarray(2.0**bits / 3, z.dtype)
     # Integers of at most 16 bits are exact in single precision.
-    cells = jnp.clip(cells, 0, 2.0**bits - 1).astype(jnp.uint32)
+    cells = jnp.clip(positions, 0, 2.0**bits - 1).astype(jnp.uint32)
     return [cells[:, i] for i in range(d)]
 
 
