@@ -38,7 +38,7 @@ from .sampling import SamplingPlan
 _PATHS_OF_TRIALS = 512, 2048, 8192
 # A trial takes at most this share of the samples of the estimate: the first one, and any
 # that follows. Where the estimate takes 3 steps (1 and 2, on two levels), a path of the
-# trial takes 7 on the same noise (1, 2 and 4), or 6 with half the steps on both levels.
+# trial takes 7 on the same noise (1, 2 and 4), or 6 with halved steps on both levels.
 _SHARE_OF_FIRST_TRIAL = 1 / 8
 _SHARE_OF_LATER_TRIALS = 1 / 32
 # The standard error of fewer paths than this is itself too uncertain. An estimate whose
@@ -78,7 +78,7 @@ def trial_with_finer_level(
     There are two kinds of trials. One takes independent paths, with the same noise on all
     levels if the solver allows it, so that their differences vary little. Even so, the
     standard error of a difference may be a hundred times the error of an estimate by value
-    functions or sorted paths. So these are sampled again with half the steps, by the
+    functions or sorted paths. So these are sampled again with halved steps, by the
     programs that are compiled already: a change of ten errors is then visible. (Sorted
     paths whose steps may miss a rotation get the first kind all the same, since a change of
     less than ten errors would remain possible.)"""
@@ -87,7 +87,7 @@ def trial_with_finer_level(
     key = trial_key(key)
     is_fitted = isinstance(estimate.sampling, ValueFunctions)
     angle = unresolved_angle(problem.with_any_steps())
-    has_same_sampling = plan.with_half_steps is not None and (
+    has_same_sampling = plan.with_halved_steps is not None and (
         is_fitted or angle is None
     )
     if has_same_sampling:
@@ -173,7 +173,7 @@ def _message_on_chance(
 def _caveat(estimate: Expectation, changes: _Changes) -> str:
     worst = int(np.argmax(changes.visible / changes.errors))
     return (
-        f"a trial with half the steps, on {changes.num_paths:,} paths, could only see a "
+        f"a trial with halved steps, on {changes.num_paths:,} paths, could only see a "
         f"change of the mean{label_of(estimate, worst)} above {changes.visible[worst]:.1e}"
     )
 
@@ -209,15 +209,15 @@ def _changes_on_same_noise(
 def _changes_by_same_sampling(
     estimate: Expectation, plan: SamplingPlan, key: PRNGKeyArray, devices: Devices
 ) -> _Changes | None:
-    """The changes on samples of the same kind with half the steps; `None` if too many
+    """The changes on samples of the same kind with halved steps; `None` if too many
     fail."""
-    assert plan.with_half_steps is not None
+    assert plan.with_halved_steps is not None
     # At least two samples, for a standard error; and a whole batch, since a part of one
     # takes as long.
     num_samples = max(
         2, plan.batch_size, int(_SHARE_OF_FIRST_TRIAL * estimate.num_samples)
     )
-    trial_plan = plan.with_half_steps()._replace(
+    trial_plan = plan.with_halved_steps()._replace(
         num_samples=num_samples, is_quick=plan.is_quick
     )
     trial = run(trial_plan, key, devices)

@@ -112,7 +112,7 @@ class SamplingPlan(NamedTuple):
     - `rounding_floor`, `digests`: as in `Expectation`.
     - `simulate_paths`: for paths computed outside JAX, maps the number of the first sample
         and the number of samples to an argument that the sampler takes before the keys.
-    - `with_half_steps`: makes the plan with half the steps on all levels, whose samples
+    - `with_halved_steps`: makes the plan with halved steps on all levels, whose samples
         need no other program; `None` if that would take long.
     """
 
@@ -130,7 +130,7 @@ class SamplingPlan(NamedTuple):
     rounding_floor: int = 1
     digests: dict[str, str] | None = None
     simulate_paths: Callable[[int, int], Any] | None = None
-    with_half_steps: Callable[[], "SamplingPlan"] | None = None
+    with_halved_steps: Callable[[], "SamplingPlan"] | None = None
 
 
 class AbstractSampling(eqx.Module):

@@ -55,7 +55,7 @@ def levels_of(dt0: float, steps_of_dt0: StepNumbers, levels: int, dtype: Any) ->
 
 
 def halved(levels: Level) -> Level:
-    """Levels with half the steps of these."""
+    """These levels with halved steps."""
     return Level(
         index=levels.index,
         h=levels.h / 2,

@@ -235,8 +235,8 @@ class Problem(eqx.Module):
         `most_steps` is static, they would compile anew for another room."""
         return dataclasses.replace(self, most_steps=0)
 
-    def with_half_steps(self) -> "Problem":
-        """The same problem with half the steps on all levels."""
+    def with_halved_steps(self) -> "Problem":
+        """The same problem with halved steps on all levels."""
         return dataclasses.replace(self, levels=halved(self.levels))
 
     def level(self, index: IntScalarLike) -> Level:

@@ -92,7 +92,7 @@ def test_where_levels_cannot_share_their_noise_the_trial_has_paths_of_their_own(
 @pytest.mark.slow
 def test_a_rotation_that_steps_miss_is_told_where_the_bar_is_small():
     """Near a maximum of the bias two levels agree, 24 bars off. Plain paths would not show
-    the change: half the steps are taken with the same value functions."""
+    the change: halved steps are taken with the same value functions."""
 
     def energy(t, p, q, args):
         potential = 1.5 * jnp.array([-q[1], q[0]])

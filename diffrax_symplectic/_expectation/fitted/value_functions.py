@@ -147,17 +147,17 @@ class ValueFunctions(AbstractSampling):
         return plan._replace(
             reason=_reason(basis, choice),
             remainder=comparison.remainder(problem.dtype),
-            with_half_steps=(
-                ft.partial(_with_half_steps, plan, key) if chosen.is_quick else None
+            with_halved_steps=(
+                ft.partial(_with_halved_steps, plan, key) if chosen.is_quick else None
             ),
         )
 
 
-def _with_half_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
-    """A plan of `ValueFunctions` with half the steps on all levels. Only the last level is
+def _with_halved_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
+    """A plan of `ValueFunctions` with halved steps on all levels. Only the last level is
     fitted: each other level now has the steps of the one after it, and takes its fit."""
     problem, functions, *others = plan.sampler.args  # pyright: ignore (a `Partial`)
-    finer_problem = problem.with_half_steps()
+    finer_problem = problem.with_halved_steps()
     last_level = len(problem.levels.h) - 1
     last_functions = _fits(finer_problem, key, functions.basis, [last_level])
     known_functions = jtu.tree_map(lambda x: x[1:], functions)

@@ -148,10 +148,10 @@ class ArrayRQMC(AbstractSampling):
                 least_samples=_LEAST_REPLICATES,
             )
 
-        # With half the steps the program is the same.
+        # With halved steps the program is the same.
         any_steps = problem.with_any_steps()
-        with_half_steps = ft.partial(plan_for, any_steps.with_half_steps())
-        return plan_for(any_steps)._replace(with_half_steps=with_half_steps)
+        with_halved_steps = ft.partial(plan_for, any_steps.with_halved_steps())
+        return plan_for(any_steps)._replace(with_halved_steps=with_halved_steps)
 
 
 def _samples_of_replicate(
