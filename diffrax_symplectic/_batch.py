@@ -26,18 +26,18 @@ _MOST_GROUPS = 256
 
 
 @jax.custom_batching.custom_vmap
-def most_of_batch(number: IntScalarLike) -> IntScalarLike:
+def largest_in_batch(number: IntScalarLike) -> IntScalarLike:
     """The largest `number` over all paths of a batch, itself not batched. A loop of this
     length keeps unbatched values unbatched."""
     return number
 
 
-@most_of_batch.def_vmap
+@largest_in_batch.def_vmap
 def _(size, in_batched, number):
     del size
     largest = jnp.max(number, 0) if in_batched[0] else number
     # The function is called again, since an outer batch may have numbers, too.
-    return most_of_batch(largest), False
+    return largest_in_batch(largest), False
 
 
 def batched_like(values: _T, others: PyTree) -> _T:
