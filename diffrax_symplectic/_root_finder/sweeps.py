@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
-from .._batch import batched_like, materialize, largest_in_batch
+from .._batch import batched_like, largest_in_batch, materialize
 from .._compat import ω
 from .._custom_types import IntScalarLike
 from .tolerance import converged, CorrectionSize, log2, LOG2_MARGIN, Tolerance
@@ -205,8 +205,8 @@ def _sweep_until_check(image: Map, state: _SweepState, in_halves: bool) -> _Afte
 
     if not in_halves:
         y = lax.fori_loop(0, state.num_ahead, sweep, state.y)
-        # The halves may converge to different solutions of y = \Phi(\Phi(y)), which are none
-        # of y = \Phi(y). Only their difference shows that, so it serves as the correction.
+        # The halves may converge to different solutions of y = \Phi(\Phi(y)), which do not
+        # solve y = \Phi(y). Only their difference shows that: it serves as the correction.
         return _AfterSweeps((y.q**ω - y.p**ω).ω, y)
     # A loop that also carried the previous iterate would copy it in each sweep: steps of 64
     # pairs took 1.1 to 1.4 times as long, although the program was a tenth shorter.
