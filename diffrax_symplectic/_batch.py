@@ -18,7 +18,7 @@ from ._custom_types import IntScalarLike
 
 _T = TypeVar("_T")
 
-# Stragglers are gathered and served in groups, of the batch's size over this number, so that
+# Stragglers are gathered and served in groups of the batch's size over this number, so that
 # no batch has more groups. Usually there are few stragglers, and each group costs its full
 # size. When all paths computed for as long as any was pending, ensembles with a few hard
 # paths took 8 to 85 times as long.

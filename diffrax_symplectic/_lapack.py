@@ -106,9 +106,10 @@ def _with_dependence(args: list[Any], results_before: Sequence[Any]) -> list[Any
     an operation on them waits for these."""
     if len(results_before) == 0:
         return args
-    # `never` is false, since it starts as false, but a barrier hides this from XLA, which so
-    # has to wait for an entry of each result. A barrier around results and arguments does
-    # not suffice: XLA removes it before it looks which operations can run side by side.
+    # `never` is false, since it starts as false, but a barrier hides this from XLA: so the
+    # arguments wait for an entry of each result. A barrier around results and arguments
+    # does not suffice: XLA removes it before it looks which operations can run side by
+    # side.
     never = lax.optimization_barrier(jnp.array(False))
     for x in results_before:
         if _has_numbers(x):

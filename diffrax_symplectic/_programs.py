@@ -159,17 +159,19 @@ class _Program:
         num_consts = len(self.jaxpr.constvars)
         invars = self.jaxpr.invars
         args = [
-            _with_dtype(x, variable.aval.dtype)
-            for x, variable in zip([*numbers[num_consts:], *arrays], invars, strict=True)
+            _with_dtype_of(variable.aval, x)
+            for x, variable in zip(
+                [*numbers[num_consts:], *arrays], invars, strict=True
+            )
         ]
         results = evaluated(self.jaxpr, numbers[:num_consts], args)
         return eqx.combine(self.treedef.unflatten(results), self.static)
 
 
-def _with_dtype(x: Any, dtype: Any) -> Array | np.ndarray:
+def _with_dtype_of(aval: Any, x: Any) -> Array | np.ndarray:
     # Times may be numbers of Python.
-    has_dtype = eqx.is_array(x) and x.dtype == dtype
-    return x if has_dtype else jnp.asarray(x, dtype)
+    has_dtype = eqx.is_array(x) and x.dtype == aval.dtype
+    return x if has_dtype else jnp.asarray(x, aval.dtype)
 
 
 def _numbers_apart(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:
@@ -320,9 +322,7 @@ def _description_of_value(x: Any, only_named: list[Any]) -> Hashable:
             (name, _description_of_value(x[name], only_named)) for name in sorted(x)
         )
     if isinstance(x, tuple | list):
-        return type(x), tuple(
-            _description_of_value(item, only_named) for item in x
-        )
+        return type(x), tuple(_description_of_value(item, only_named) for item in x)
     if eqx.is_array(x):
         return _array_value(x)
     if isinstance(x, float | complex):
