@@ -157,14 +157,12 @@ class _Program:
         leaves = jtu.tree_leaves(inputs)
         arrays = [x for x, is_it in zip(leaves, self.is_array, strict=True) if is_it]
         num_consts = len(self.jaxpr.constvars)
-        invars = self.jaxpr.invars
-        args = [
+        args = [*numbers[num_consts:], *arrays]
+        converted = [
             _with_dtype_of(variable.aval, x)
-            for x, variable in zip(
-                [*numbers[num_consts:], *arrays], invars, strict=True
-            )
+            for x, variable in zip(args, self.jaxpr.invars, strict=True)
         ]
-        results = evaluated(self.jaxpr, numbers[:num_consts], args)
+        results = evaluated(self.jaxpr, numbers[:num_consts], converted)
         return eqx.combine(self.treedef.unflatten(results), self.static)
 
 
