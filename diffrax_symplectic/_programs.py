@@ -349,7 +349,7 @@ def _is_hashable(x: Any) -> bool:
 
 
 class _ByIdentity:
-    """A value that is equal to itself only, for values without a hash of their own."""
+    """A value that is equal to itself only, whether or not it has a hash of its own."""
 
     def __init__(self, value: Any):
         self.value = value
