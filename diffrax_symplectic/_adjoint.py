@@ -294,7 +294,8 @@ class _Walk(NamedTuple):
     - `a_y`, `a_parameters`: the derivatives of the loss with respect to this state, and to
         the parameters so far.
     - `num_saved`: the number of saved times before this one.
-    - `size`: the size of nearby states.
+    - `size`: the largest entry of this state, or of a later one with a discount for each
+        step between.
     - `agrees`: whether the pass agreed with all checkpoints so far.
     """
 
@@ -358,10 +359,11 @@ def _solve_bwd(
         )
 
     if ts is None:
-        a_y1 = jtu.tree_map(lambda a: a[-1], a_ys)
+        a_y1 = jtu.tree_map(lambda rows: rows[-1], a_ys)
     else:
-        # States saved at the end itself are met in the last step.
-        a_y1 = jtu.tree_map(lambda a: jnp.zeros_like(a[0]), a_ys)
+        # States that were saved at the end, too, are added in the first step back, as all
+        # that were saved after the start of that step.
+        a_y1 = jtu.tree_map(lambda rows: jnp.zeros_like(rows[0]), a_ys)
     walk = _Walk(
         i=jnp.asarray(num_steps),
         y=y1,
@@ -374,10 +376,14 @@ def _solve_bwd(
     walk = lax.while_loop(is_going, step_back, walk)
     a_y0 = walk.a_y
     if ts is not None:
-        # States saved at the start itself lie in no step.
+        # Each step back passes the times after its start, so that those of states saved at
+        # the start of the solve are left.
         is_at_start = jnp.arange(len(ts)) < walk.num_saved
-        add_rows = lambda a, rows: a + jnp.tensordot(is_at_start, rows, 1)
-        a_y0 = jtu.tree_map(add_rows, a_y0, a_ys)
+
+        def with_saved_at_start(a: Array, rows: Array) -> Array:
+            return a + jnp.tensordot(is_at_start, rows, 1)
+
+        a_y0 = jtu.tree_map(with_saved_at_start, a_y0, a_ys)
     return _checked_gradients(walk.agrees, throw, (a_y0, *walk.a_parameters))
 
 
@@ -427,20 +433,20 @@ _SIZE_KEPT_PER_STEP = 0.9
 
 
 def _meet_checkpoint(
-    y: Y,
+    y_found: Y,
     checkpoints: PyTree[Array],
     i: IntScalarLike,
     steps_between: IntScalarLike,
     agreed_so_far: Bool[Array, ""],
     size: Array,
 ) -> tuple[Y, Bool[Array, ""]]:
-    """The state `y` after `i` steps, replaced by the checkpoint if there is one; and
-    whether the pass `agreed_so_far` and agrees with this one, for states of this `size`.
-    `steps_between` is the number of steps from one checkpoint to the next."""
+    """The state after `i` steps: the checkpoint if there is one, and otherwise `y_found`;
+    and whether the pass `agreed_so_far` and agrees with this checkpoint, for states of this
+    `size`. `steps_between` is the number of steps from one checkpoint to the next."""
     # Between checkpoints this reads the checkpoint before, and does not use it.
     row, rest = jnp.divmod(i, steps_between)
     checkpoint = jtu.tree_map(lambda rows: rows[row], checkpoints)
-    error = optx.max_norm((y**ω - checkpoint**ω).ω)
+    error = optx.max_norm((y_found**ω - checkpoint**ω).ω)
     # A third of the digits may be lost to rounding errors on the way. The gradients, which
     # are taken at states between checkpoints, then keep two thirds.
     eps = float(jnp.finfo(error.dtype).eps)
@@ -450,7 +456,7 @@ def _meet_checkpoint(
     def saved_if_there_is_one(found: Array, saved: Array) -> Array:
         return jnp.where(is_at_checkpoint, saved, found)
 
-    y = jtu.tree_map(saved_if_there_is_one, y, checkpoint)
+    y = jtu.tree_map(saved_if_there_is_one, y_found, checkpoint)
     return y, agreed_so_far & (agrees | ~is_at_checkpoint)
 
 

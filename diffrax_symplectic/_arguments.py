@@ -27,8 +27,9 @@ _POSITIONS_FIRST = (("x", "v"), ("x", "p"), ("q", "v"))
 
 class ShortTraceback:
     """A context in which a `ValueError` that this package raises loses the frames between
-    the function that the user called and the check. Errors of the user's functions keep
-    theirs, and all errors do with `jax.config.update("jax_traceback_filtering", "off")`."""
+    the function that the user called and the check. Errors from the user's functions keep
+    these frames, and so do all errors with
+    `jax.config.update("jax_traceback_filtering", "off")`."""
 
     def __enter__(self) -> None:
         return None
@@ -36,8 +37,9 @@ class ShortTraceback:
     def __exit__(self, kind: Any, error: Any, traceback: Any) -> None:
         if not isinstance(error, ValueError) or _shows_all_frames():
             return
+        # The last frame is that of the line that raised the error, the first that of the
+        # function in which this context stands: without a next, only the first is left.
         if extract_tb(traceback)[-1].filename.startswith(_PACKAGE):
-            # The first is the function in which this context stands.
             traceback.tb_next = None
 
 
@@ -150,9 +152,12 @@ def check_terms(terms: Any) -> None:
 def check_args(args: Any) -> None:
     """Raises a `ValueError` for `args` of which no program can be compiled."""
     for leaf in jtu.tree_leaves(args):
-        # Words and functions may be compared and called.
-        is_constant = isinstance(leaf, Hashable) and not isinstance(leaf, Iterator)
-        if not (is_numeric(leaf) or (is_constant and not eqx.is_array_like(leaf))):
+        # Leaves other than numbers, such as strings and functions, become constants of the
+        # program, which is found by them: they must have a hash. An iterator has one, but
+        # yields other values each time.
+        has_fixed_value = isinstance(leaf, Hashable) and not isinstance(leaf, Iterator)
+        is_constant = has_fixed_value and not eqx.is_array_like(leaf)
+        if not (is_numeric(leaf) or is_constant):
             raise ValueError(
                 "`args` must hold arrays, in tuples, lists and dictionaries, or in an "
                 f"`equinox.Module`; got a {type(leaf).__name__}, {leaf!r}."

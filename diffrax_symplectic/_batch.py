@@ -18,26 +18,26 @@ from ._custom_types import IntScalarLike
 
 _T = TypeVar("_T")
 
-# Stragglers are gathered and served in groups, whose size is that of the batch over this
-# number. Usually there are few stragglers, and each group costs its full size. When all
-# paths computed for as long as any was pending, ensembles with a few hard paths took 8 to
-# 85 times as long.
+# Stragglers are gathered and served in groups of the batch's size over this number, so that
+# no batch has more groups. Usually there are few stragglers, and each group costs its full
+# size. When all paths computed for as long as any was pending, ensembles with a few hard
+# paths took 8 to 85 times as long.
 _MOST_GROUPS = 256
 
 
 @jax.custom_batching.custom_vmap
-def most_of_batch(number: IntScalarLike) -> IntScalarLike:
+def largest_in_batch(number: IntScalarLike) -> IntScalarLike:
     """The largest `number` over all paths of a batch, itself not batched. A loop of this
     length keeps unbatched values unbatched."""
     return number
 
 
-@most_of_batch.def_vmap
+@largest_in_batch.def_vmap
 def _(size, in_batched, number):
     del size
     largest = jnp.max(number, 0) if in_batched[0] else number
     # The function is called again, since an outer batch may have numbers, too.
-    return most_of_batch(largest), False
+    return largest_in_batch(largest), False
 
 
 def batched_like(values: _T, others: PyTree) -> _T:
@@ -90,8 +90,8 @@ def _(primals, tangents):
 
 
 def error_if_alone(pred: Bool[Array, ""], message: str) -> Bool[Array, ""]:
-    """`pred`; if it is true, an error when run. In a batch there is no error: it would stop
-    the other paths."""
+    """Returns `pred`, and raises an error when run if it is true. Under `vmap` nothing is
+    raised, since an error of one path would stop all others of its batch."""
 
     @jax.custom_batching.custom_vmap
     def checked(pred):
@@ -106,8 +106,8 @@ def error_if_alone(pred: Bool[Array, ""], message: str) -> Bool[Array, ""]:
 
 
 def refused_where(fault: Bool[Array, ""], advice: str) -> Bool[Array, ""]:
-    """The fault, with a `ValueError` where it is known, and otherwise an error when run,
-    but not in a batch."""
+    """Returns `fault`. If it is true, raises a `ValueError`; or if it is not known while
+    tracing, an error when run, except under `vmap`, as `error_if_alone`."""
     if is_traced(fault):
         return error_if_alone(fault, advice)
     if fault:
@@ -135,18 +135,20 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
     # Nested batches are joined into one, so that stragglers of all share the groups: arrays
     # of paths, of shape `(outer, inner, ...)`, become `(outer * inner, ...)`.
     @serve.def_vmap
-    def _(size, in_batched, *paths_and_common):
+    def _(outer_size, in_batched, *paths_and_common):
+        # The first three arguments have an axis for the inner paths, `common_arrays` have
+        # none.
         *are_paths_batched, are_common_batched = in_batched
-        *paths, common_arrays = paths_and_common
-        paths = _repeated(size, are_paths_batched, paths)
+        *inner_paths, common_arrays = paths_and_common
+        paths = _repeated(outer_size, are_paths_batched, inner_paths)
         pending, _, _ = paths
         _, inner_size = pending.shape
 
         def join_axes(x: Array) -> Array:
-            return x.reshape(size * inner_size, *x.shape[2:])
+            return x.reshape(outer_size * inner_size, *x.shape[2:])
 
         def separate_axes(x: Array) -> Array:
-            return x.reshape(size, inner_size, *x.shape[1:])
+            return x.reshape(outer_size, inner_size, *x.shape[1:])
 
         # A common array that differs between the outer batches is repeated for the inner
         # ones, and is one of the paths' own.
@@ -213,11 +215,13 @@ def _in_groups(
         """Applies `call` for the next group of the paths that are pending, and removes
         these from `pending`."""
         pending, value = carry
-        # The indices are those of `jnp.nonzero`, which compiles to a dozen kernels. If
-        # fewer paths are pending, the surplus indices lie beyond the batch and are dropped.
-        # Unsigned indices need no code for negative ones.
-        is_pending, places = lax.top_k(pending.astype(jnp.float32), group_size)
-        places = jnp.where(is_pending > 0, places, size).astype(jnp.uint32)
+        # The first pending paths, by their numbers in the batch: the largest entries of
+        # zeros and ones. (`jnp.nonzero` compiles to a dozen kernels.) If fewer paths are
+        # pending than a group has, the rest of it gets the number `size`, which is beyond
+        # the batch, so that `scatter` drops it. Unsigned numbers need no code for negative
+        # ones.
+        is_pending, numbers = lax.top_k(pending.astype(jnp.float32), group_size)
+        places = jnp.where(is_pending > 0, numbers, size).astype(jnp.uint32)
         gathered = jtu.tree_map(lambda x: x[places], (value, own_arrays))
         values_of_group = jax.vmap(call_for_path)(*gathered)
 

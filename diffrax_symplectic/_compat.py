@@ -182,39 +182,54 @@ def is_program(x: Any) -> bool:
 
 def is_rule(x: Any) -> bool:
     """Whether this parameter of an operation is a function, such as the rule of a custom
-    derivative, or a callback. JAX wraps some of these in objects that are not callable, and
-    a mesh of devices is."""
+    derivative, or a callback."""
+    # Types and meshes of devices are callable, but no rules. Some rules JAX wraps in an
+    # object that is not callable, with the function as `call_wrapped`.
     if isinstance(x, type | jax.sharding.Mesh):
         return False
     return callable(x) or hasattr(x, "call_wrapped")
 
 
-def with_constants_for(jaxpr: Jaxpr, places: Sequence[tuple[int, int]]) -> Jaxpr:
-    """A program with new constants, after those that it has, in these places: each is the
-    number of an operation and that of its argument, or the number of operations and that
-    of a result."""
+class OperandPlace(NamedTuple):
+    """Where a program reads a value.
+
+    - `operation`: the number of the operation that reads it. The number after that of the
+        last operation stands for what the program returns.
+    - `position`: its position among the arguments of the operation, or among the results of
+        the program.
+    """
+
+    operation: int
+    position: int
+
+
+def with_constants_at(jaxpr: Jaxpr, places: Sequence[OperandPlace]) -> Jaxpr:
+    """A program that reads new constants in these places, in place of what it reads there.
+    They come after the constants that it has."""
     operands: list[list[Any]] = [list(eqn.invars) for eqn in jaxpr.eqns]
     operands.append(list(jaxpr.outvars))
-    avals = [operands[k][place].aval for k, place in places]
+    avals = [operands[place.operation][place.position].aval for place in places]
     structs = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
-    # Versions of JAX construct variables from different arguments: here it does so itself.
+    # Each version of JAX constructs variables from other arguments. So JAX makes them here:
+    # they are the inputs of a trace.
     new_constants = jax.make_jaxpr(lambda *xs: xs)(*structs).jaxpr.invars
-    for (k, place), constant in zip(places, new_constants):
-        operands[k][place] = constant
+    for place, constant in zip(places, new_constants):
+        operands[place.operation][place.position] = constant
     *of_operations, results = operands
     eqns = [eqn.replace(invars=xs) for eqn, xs in zip(jaxpr.eqns, of_operations)]
     constants = [*jaxpr.constvars, *new_constants]
     return jaxpr.replace(eqns=eqns, outvars=results, constvars=constants)
 
 
-# Not to be made while other threads use JAX.
+# Made on import, since no such context may be made while other threads use JAX.
 _numbered_traces = jax.make_user_context(0)
 
 
 def with_traces_of(number: int) -> Any:
-    """A context in which JAX uses only those of its traces that were made in the same one.
-    It keeps those of functions within others, such as `diffrax.diffeqsolve`, by the
-    identity of what they are called with."""
+    """A context in which JAX uses a trace again only if it was made in a context of the
+    same number. Otherwise JAX would use the trace of an inner function, such as
+    `diffrax.diffeqsolve`, whenever its arguments are the same objects, although a function
+    among them may compute something else by now."""
     return _numbered_traces(number)
 
 
@@ -232,12 +247,14 @@ def programs_in(eqn: JaxprEqn) -> list[Jaxpr]:
 
 def results_of_operation(eqn: JaxprEqn, args: Sequence[Any], params: Any) -> list[Any]:
     """The results of one operation of a jaxpr, with these parameters."""
-    params = eqn.primitive.get_bind_params(params)
-    # Some versions of JAX return a pair: functions, which come first among the arguments,
-    # and the other parameters.
-    functions, params = params if isinstance(params, tuple) else ((), params)
+    bind_params = eqn.primitive.get_bind_params(params)
+    functions = ()
+    # Some versions of JAX return a pair: functions, which `bind` takes before the other
+    # arguments, and the parameters.
+    if isinstance(bind_params, tuple):
+        functions, bind_params = bind_params
     with eqn.ctx.manager:
-        outs = eqn.primitive.bind(*functions, *args, **params)
+        outs = eqn.primitive.bind(*functions, *args, **bind_params)
     return outs if eqn.primitive.multiple_results else [outs]
 
 
@@ -321,11 +338,13 @@ def solve_state(loop_state: Any) -> SolveState:
     )
 
 
-def without_derivatives(loop_state: Any, of_solver_state: Callable) -> Any:
-    """A state of Diffrax's loop without the state of the equation, and with
-    `of_solver_state(x)` in place of each leaf `x` of the solver's state."""
-    solver_state = jtu.tree_map(of_solver_state, loop_state.solver_state)
-    # An object that is no array, so that using it by mistake is an error.
+def without_derivatives(loop_state: Any, stop_gradient: Callable) -> Any:
+    """A state of Diffrax's loop through which no derivatives pass: without the state of the
+    equation, and with `stop_gradient(x)` in place of each leaf `x` of the solver's
+    state."""
+    solver_state = jtu.tree_map(stop_gradient, loop_state.solver_state)
+    # In place of the state there is an object that is no array, so that using it by mistake
+    # is an error.
     return dataclasses.replace(loop_state, y=object(), solver_state=solver_state)
 
 
@@ -384,8 +403,9 @@ class StepTimes(NamedTuple):
         _, *other_state = self.init_state.controller_state
         initial_time = self.init_state.tprev
         time_after_first_step = self.init_state.tnext
-        # The controller computes the end of a step from the number of steps in its state,
-        # and its start from `t1`, which is not used.
+        # The controller is asked for the step after `i - 1` steps. It computes the end of
+        # that step from the number of steps, which its state begins with. The start, for
+        # which it takes `t1`, is not used.
         _, _, time_after_step, *_ = self.controller.adapt_step_size(
             t0=initial_time,
             t1=time_after_first_step,

@@ -71,25 +71,25 @@ class _SequentialLapack:
 
     def run(self, program: Jaxpr | ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
         """The results of a program for these arguments."""
-        return results_of_program(program, args, self._results)
+        return results_of_program(program, args, self._results_of_eqn)
 
-    def _results(self, eqn: Any, args: list[Any]) -> Sequence[Any]:
+    def _results_of_eqn(self, eqn: Any, args: list[Any]) -> Sequence[Any]:
         """The results of one operation. An operation that calls LAPACK waits for the last
         one before that did."""
-        name = eqn.primitive.name
         if not _calls_lapack(eqn):
             return results_of_operation(eqn, args, eqn.params)
+        name = eqn.primitive.name
         if name in CALLS:
             return self.run(eqn.params[CALLS[name]], args)
         if name == "custom_linear_solve":
             solve, args_of_solve = _program_of_linear_solve(eqn, args)
             return self.run(solve, args_of_solve)
         # A loop as a whole waits for the call before, and the next call for the loop.
-        args = _after(self._results_before, args)
+        args_in_turn = _with_dependence(args, self._results_before)
         params = eqn.params
         if name in _CONTROL_FLOW:
             params = _with_turns_inside(params)
-        self._results_before = results_of_operation(eqn, args, params)
+        self._results_before = results_of_operation(eqn, args_in_turn, params)
         return self._results_before
 
 
@@ -101,20 +101,23 @@ def _calls_lapack(eqn: Any) -> bool:
     return any(map(_calls_lapack, inner_eqns))
 
 
-def _after(results_before: Sequence[Any], args: list[Any]) -> list[Any]:
-    """`args`, with the same values, but computed from all of `results_before`, too."""
+def _with_dependence(args: list[Any], results_before: Sequence[Any]) -> list[Any]:
+    """`args`, with the same values, but computed from all of `results_before`, too, so that
+    an operation on them waits for these."""
     if len(results_before) == 0:
         return args
-    # `never` is false, which XLA does not see. A barrier alone does not suffice: XLA
-    # removes it before it looks which operations can run side by side.
+    # `never` is false, since it starts as false, but a barrier hides this from XLA: so the
+    # arguments wait for an entry of each result. A barrier around results and arguments
+    # does not suffice: XLA removes it before it looks which operations can run side by
+    # side.
     never = lax.optimization_barrier(jnp.array(False))
     for x in results_before:
-        if _is_plain(x):
+        if _has_numbers(x):
             never = never & (jnp.ravel(x)[0] != 0)
-    return [_zeros_if(never, x) if _is_plain(x) else x for x in args]
+    return [_zeros_if(never, x) if _has_numbers(x) else x for x in args]
 
 
-def _is_plain(x: Any) -> bool:
+def _has_numbers(x: Any) -> bool:
     """Whether this is an array of numbers, not of random keys, with at least one entry."""
     is_extended = jnp.issubdtype(jnp.result_type(x), jax.dtypes.extended)
     return jnp.size(x) > 0 and not is_extended

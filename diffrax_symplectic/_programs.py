@@ -41,8 +41,9 @@ from ._compat import (
     Jaxpr,
     JaxprEqn,
     Literal,
+    OperandPlace,
     quick_options,
-    with_constants_for,
+    with_constants_at,
     with_traces_of,
 )
 
@@ -94,24 +95,31 @@ def traced(fn: Callable, *inputs: PyTree, identity: Any = None) -> Traced:
     is_array = [_is_array_or_struct(leaf) for leaf in leaves]
     static_results = None
 
-    # JAX keeps traces by the identity of functions, too: this one is new in each call.
+    # JAX keeps traces by the identity of functions. This function is new in each call of
+    # `traced`, so that it is always traced.
     def results(*arrays: Array) -> PyTree[Array]:
         nonlocal static_results
         remaining = iter(arrays)
-        whole = [next(remaining) if is_it else x for is_it, x in zip(is_array, leaves)]
-        of_arrays, inputs = treedef.unflatten(whole)
-        result = of_arrays(*inputs)
+        all_leaves = [
+            next(remaining) if is_it else leaf for is_it, leaf in zip(is_array, leaves)
+        ]
+        fn_with_arrays, inputs = treedef.unflatten(all_leaves)
+        result = fn_with_arrays(*inputs)
         dynamic, static_results = eqx.partition(result, eqx.is_array_like)
         return dynamic
 
-    arrays = [x for is_it, x in zip(is_array, leaves) if is_it]
+    arrays = [leaf for is_it, leaf in zip(is_array, leaves) if is_it]
     closed, struct = jax.make_jaxpr(results, return_shape=True)(*arrays)
-    jaxpr, numbers = _numbers_apart(closed.jaxpr)
-    # The function comes first. It may be a Module, or a `jax.tree_util.Partial`.
-    own_arrays = [leaf for leaf in jtu.tree_leaves(fn) if eqx.is_array(leaf)]
-    is_input = is_array[len(jtu.tree_leaves(fn)) :]
-    program = _Program(jaxpr, is_input, jtu.tree_structure(struct), static_results)
-    numbers = [*map(jnp.asarray, closed.consts), *numbers, *own_arrays]
+    jaxpr, text_numbers = _numbers_apart(closed.jaxpr)
+    # The leaves of the function come before those of the inputs. It has some if it is a
+    # Module, or a `jax.tree_util.Partial`.
+    fn_leaves = jtu.tree_leaves(fn)
+    fn_arrays = [leaf for leaf in fn_leaves if eqx.is_array(leaf)]
+    is_input_array = is_array[len(fn_leaves) :]
+    treedef_of_result = jtu.tree_structure(struct)
+    program = _Program(jaxpr, is_input_array, treedef_of_result, static_results)
+    # In the order of the constants and the first inputs of `jaxpr`.
+    numbers = [*map(jnp.asarray, closed.consts), *text_numbers, *fn_arrays]
     return Traced(_interned(program, fn if identity is None else identity), numbers)
 
 
@@ -125,8 +133,10 @@ class _Program:
     - `jaxpr`: its program. The constants and the first inputs are the `numbers` of a
         `Traced`.
     - `is_array`: which leaves of the inputs of the function are arrays.
-    - `treedef`, `static`: the structure of the arrays that it returns, and what else.
-    - `text`: a hash of what it computes, the same in all processes; set by `_interned`.
+    - `treedef`, `static`: the structure of what the function returns, and those of its
+        leaves that are not arrays.
+    - `fingerprint`: a hash of what it computes, the same in all processes; set by
+        `_interned`.
     """
 
     def __init__(
@@ -136,26 +146,28 @@ class _Program:
         self.is_array = is_array
         self.treedef = treedef
         self.static = static
-        self.text = ""
+        self.fingerprint = ""
 
+    # `digest` reads this, so that it must tell programs from each other in all processes.
     def __repr__(self) -> str:
-        return self.text
+        return self.fingerprint
 
     def value(self, numbers: list[Array], inputs: PyTree) -> PyTree:
+        """The value of the function, for the numbers of its `Traced`."""
         leaves = jtu.tree_leaves(inputs)
         arrays = [x for x, is_it in zip(leaves, self.is_array, strict=True) if is_it]
         num_consts = len(self.jaxpr.constvars)
-        arrays = [*numbers[num_consts:], *arrays]
-        # Times may be numbers of Python.
-        arrays = [
-            _converted(x, variable.aval)
-            for x, variable in zip(arrays, self.jaxpr.invars, strict=True)
+        args = [*numbers[num_consts:], *arrays]
+        converted = [
+            _with_dtype_of(variable.aval, x)
+            for x, variable in zip(args, self.jaxpr.invars, strict=True)
         ]
-        results = evaluated(self.jaxpr, numbers[:num_consts], arrays)
+        results = evaluated(self.jaxpr, numbers[:num_consts], converted)
         return eqx.combine(self.treedef.unflatten(results), self.static)
 
 
-def _converted(x: Any, aval: Any) -> Array | np.ndarray:
+def _with_dtype_of(aval: Any, x: Any) -> Array | np.ndarray:
+    # Times may be numbers of Python.
     has_dtype = eqx.is_array(x) and x.dtype == aval.dtype
     return x if has_dtype else jnp.asarray(x, aval.dtype)
 
@@ -164,23 +176,25 @@ def _numbers_apart(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:
     """The program with constants for numbers in its text, and these numbers."""
     jaxpr = jaxpr.replace(eqns=[_with_inverse_of_divisor(eqn) for eqn in jaxpr.eqns])
     places = [
-        (k, place)
+        OperandPlace(k, position)
         for k, eqn in enumerate(jaxpr.eqns)
-        for place, x in enumerate(eqn.invars)
-        if isinstance(x, Literal) and _is_data(eqn, place, x)
+        for position, x in enumerate(eqn.invars)
+        if isinstance(x, Literal) and _is_data(eqn, position, x)
     ]
-    numbers = [jaxpr.eqns[k].invars[place] for k, place in places]
-    # A result that is a number, such as a constant friction. As data it is no weak number:
-    # the results of other dtypes would change.
+    numbers = [jaxpr.eqns[place.operation].invars[place.position] for place in places]
+    # A function may return a number of its text, such as a constant friction. In the text
+    # the number may be of a weak type, which takes the dtype of what it meets, and as data
+    # it is not. So it is data only where it can meet no other dtype: its own is that of all
+    # inputs.
     dtypes = {_dtype_of(x.aval) for x in jaxpr.invars}
-    for place, x in enumerate(jaxpr.outvars):
+    for position, x in enumerate(jaxpr.outvars):
         if not isinstance(x, Literal) or dtypes != {_dtype_of(x.aval)}:
             continue
         if _has_many_digits(x):
-            places.append((len(jaxpr.eqns), place))
+            places.append(OperandPlace(len(jaxpr.eqns), position))
             numbers.append(x)
     arrays = [jnp.asarray(x.val, x.aval.dtype) for x in numbers]  # pyright: ignore
-    return with_constants_for(jaxpr, places), arrays
+    return with_constants_at(jaxpr, places), arrays
 
 
 def _with_inverse_of_divisor(eqn: JaxprEqn) -> JaxprEqn:
@@ -211,9 +225,10 @@ def _product(dtype: Any) -> JaxprEqn:
     return eqn
 
 
-def _is_data(eqn: JaxprEqn, place: int, number: Literal) -> bool:
-    """Whether a number in the text of a function is data, rather than part of a formula."""
-    if place == 1 and eqn.primitive.name in _KNOWN_SECOND:
+def _is_data(eqn: JaxprEqn, position: int, number: Literal) -> bool:
+    """Whether a number, which an operation takes at this position, is data, rather than a
+    part of a formula."""
+    if position == 1 and eqn.primitive.name in _KNOWN_SECOND:
         return False
     return _has_many_digits(number)
 
@@ -223,6 +238,8 @@ def _has_many_digits(number: Literal) -> bool:
     value = np.asarray(number.val)
     if not np.issubdtype(value.dtype, np.floating) or not np.isfinite(value):
         return False
+    # A mantissa of few binary digits becomes a whole number by a product with a small power
+    # of two.
     mantissa, _ = np.frexp(value.astype(float))
     scaled = float(mantissa) * 2**_DIGITS_OF_FORMULAS
     return scaled != round(scaled)
@@ -234,29 +251,29 @@ _lock = threading.Lock()
 
 
 def _interned(program: _Program, identity: Any) -> _Program:
-    """The program that was known before, if one computes the same. `identity` is as for
-    `traced`."""
-    named: list[Any] = []
+    """The program that was known before if it computes the same, and otherwise this one.
+    `identity` is as for `traced`."""
+    only_named: list[Any] = []
     description = (
-        _description(program.jaxpr, named),
+        _description(program.jaxpr, only_named),
         tuple(program.is_array),
         program.treedef,
         static_part(program.static),
     )
     # What a custom derivative or a callback computes is named in a trace, not written out.
     # Then only the same function has the same program.
-    key = description, static_part(identity) if named else None
+    key = description, static_part(identity) if only_named else None
     with _lock:
         known = _known.setdefault(key, program)
-    if not known.text:
-        known.text = _hash(_without_addresses(repr(description)))
+    if not known.fingerprint:
+        known.fingerprint = _hash(_without_addresses(repr(description)))
     return known
 
 
-def _description(jaxpr: Jaxpr, named: list[Any]) -> Hashable:
+def _description(jaxpr: Jaxpr, only_named: list[Any]) -> Hashable:
     """All that a program computes: equal for equal programs, since variables are numbered
-    as they appear. Appends to `named` what is named in it, but not described, such as
-    callbacks."""
+    as they appear. Appends to `only_named` what a trace names, but does not write out, such
+    as callbacks."""
     number_of: dict[Any, int] = {}
     # Most operations have the same context, whose text is long.
     contexts: dict[int, str] = {}
@@ -274,7 +291,7 @@ def _description(jaxpr: Jaxpr, named: list[Any]) -> Hashable:
         context = contexts.setdefault(id(eqn.ctx), str(eqn.ctx))
         operands = tuple(map(variable, eqn.invars))
         results = tuple(map(variable, eqn.outvars))
-        params = _description_of_value(eqn.params, named)
+        params = _description_of_value(eqn.params, only_named)
         operations.append((eqn.primitive, context, operands, params, results))
     outputs = tuple(map(variable, jaxpr.outvars))
     return tuple(inputs), tuple(operations), outputs
@@ -290,27 +307,27 @@ def _dtype_of(aval: Any) -> str:
     return dtype
 
 
-def _description_of_value(x: Any, named: list[Any]) -> Hashable:
-    """A parameter of an operation."""
+def _description_of_value(x: Any, only_named: list[Any]) -> Hashable:
+    """A parameter of an operation, as in `_description`."""
     if is_program(x):
         # The arrays that a program within the function closes over are part of it.
         consts = x.consts if isinstance(x, ClosedJaxpr) else ()
-        values = tuple(_description_of_value(const, named) for const in consts)
+        values = tuple(_description_of_value(const, only_named) for const in consts)
         jaxpr: Any = x.jaxpr if isinstance(x, ClosedJaxpr) else x
-        return values, _description(jaxpr, named)
+        return values, _description(jaxpr, only_named)
     if isinstance(x, Mapping):
         return tuple(
-            (name, _description_of_value(x[name], named)) for name in sorted(x)
+            (name, _description_of_value(x[name], only_named)) for name in sorted(x)
         )
     if isinstance(x, tuple | list):
-        return type(x), tuple(_description_of_value(item, named) for item in x)
+        return type(x), tuple(_description_of_value(item, only_named) for item in x)
     if eqx.is_array(x):
         return _array_value(x)
     if isinstance(x, float | complex):
         # Zeros of both signs are equal, and NaN is not equal to itself.
         return type(x), repr(x)
     if is_rule(x) or not _is_hashable(x):
-        named.append(x)
+        only_named.append(x)
         return type(x)
     return type(x), x
 
@@ -331,14 +348,14 @@ def _is_hashable(x: Any) -> bool:
     return True
 
 
-class _Same:
-    """Compares what cannot be hashed by identity."""
+class _ByIdentity:
+    """A value that is equal to itself only, whether or not it has a hash of its own."""
 
     def __init__(self, value: Any):
         self.value = value
 
     def __eq__(self, other: Any) -> bool:
-        return isinstance(other, _Same) and self.value is other.value
+        return isinstance(other, _ByIdentity) and self.value is other.value
 
     def __hash__(self) -> int:
         return id(self.value)
@@ -348,7 +365,7 @@ def static_part(tree: PyTree) -> Hashable:
     """A PyTree without the values of its arrays: their shapes and dtypes, and all else."""
     leaves, treedef = jtu.tree_flatten(tree)
     if not _is_hashable(treedef):
-        return _Same(tree)
+        return _ByIdentity(tree)
     return treedef, tuple(map(_static_leaf, leaves))
 
 
@@ -357,16 +374,16 @@ def _static_leaf(leaf: Any) -> Hashable:
         # Traces tell JAX's arrays of weak types from others.
         return leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)
     if isinstance(leaf, types.MethodType) and not _is_hashable(leaf):
-        return _Same(leaf.__self__), leaf.__func__
+        return _ByIdentity(leaf.__self__), leaf.__func__
     # `1`, `1.0` and `True` are equal, but not the same input.
-    return type(leaf), leaf if _is_hashable(leaf) else _Same(leaf)
+    return type(leaf), leaf if _is_hashable(leaf) else _ByIdentity(leaf)
 
 
 class _Remembered:
-    """Values by their keys, of which those used last are kept."""
+    """Values by their keys. The `max_size` that were used last are kept."""
 
-    def __init__(self, most: int):
-        self._most = most
+    def __init__(self, max_size: int):
+        self._max_size = max_size
         self._values: collections.OrderedDict[Hashable, Any] = collections.OrderedDict()
         self._lock = threading.Lock()
 
@@ -385,7 +402,7 @@ class _Remembered:
         with self._lock:
             self._values[key] = value
             self._values.move_to_end(key)
-            if len(self._values) > self._most:
+            if len(self._values) > self._max_size:
                 self._values.popitem(last=False)
 
 
@@ -413,11 +430,11 @@ def compiled(fn: Callable[..., Result], quickly: bool = False) -> Callable[..., 
 
         def of_arrays(arrays: list[Array]) -> Result:
             remaining = iter(arrays)
-            leaves = [
-                next(remaining) if is_array else other
-                for is_array, other in zip(is_array, others)
+            all_leaves = [
+                next(remaining) if is_it else other
+                for is_it, other in zip(is_array, others)
             ]
-            return fn(*treedef.unflatten(leaves))
+            return fn(*treedef.unflatten(all_leaves))
 
         def jitted() -> Callable:
             return jax.jit(of_arrays, compiler_options=options)
@@ -428,6 +445,7 @@ def compiled(fn: Callable[..., Result], quickly: bool = False) -> Callable[..., 
         except ValueError as error:
             if not _refuses_options(error):
                 raise
+        # Inside of another program, the options of that one apply.
         without_options = compiled(fn)
         return without_options(*args)
 
@@ -452,7 +470,7 @@ def note_call(fn: Callable, *inputs: PyTree) -> None:
     calls = _calls.get()
     if calls is not None:
         structs = jtu.tree_map(_struct_of_array, inputs)
-        calls.setdefault((_Same(fn), static_part(inputs)), (fn, *structs))
+        calls.setdefault((_ByIdentity(fn), static_part(inputs)), (fn, *structs))
 
 
 def _struct_of_array(x: Any) -> Any:
@@ -462,8 +480,9 @@ def _struct_of_array(x: Any) -> Any:
 class _Watched(NamedTuple):
     """A trace that JAX may use again.
 
-    - `number`: that of its `with_traces_of`.
-    - `calls`: the functions and inputs of the calls in it, and their programs.
+    - `number`: the argument of `with_traces_of` with which it was made.
+    - `calls`: for each call of a function of the user in it, the arguments of `traced`, and
+        the program that it was then.
     """
 
     number: int
@@ -487,13 +506,14 @@ def current_traces(fn: Callable) -> Iterator[None]:
     traces of `diffrax.diffeqsolve` by the identity of the functions in its terms: they are
     used again while these functions compute the same, since they take a second to make."""
     key = static_part(fn)
-    known = _watched.get(key, lambda: None)
-    if known is None or not known.is_current():
-        known = _Watched(next(_numbers_of_traces), [])
+    watched = _watched.get(key, lambda: None)
+    if watched is None or not watched.is_current():
+        # JAX has no traces of a new number, so it traces anew.
+        watched = _Watched(next(_numbers_of_traces), [])
     calls: dict[Hashable, tuple[Any, ...]] = {}
     token = _calls.set(calls)
     try:
-        with with_traces_of(known.number):
+        with with_traces_of(watched.number):
             yield
     finally:
         _calls.reset(token)
@@ -502,9 +522,10 @@ def current_traces(fn: Callable) -> Iterator[None]:
         try:
             new_calls.append((call, traced(*call)))
         except jax.errors.UnexpectedTracerError:
-            # Made within `fn`, from values of this trace: the next trace has another.
+            # A function that `fn` makes from values of its trace cannot be called after it.
+            # It need not be watched, since each trace makes another one.
             continue
-    _watched.put(key, _Watched(known.number, [*known.calls, *new_calls]))
+    _watched.put(key, _Watched(watched.number, [*watched.calls, *new_calls]))
 
 
 def once_for_each_signature(fn: Callable[..., Result]) -> Callable[..., Result]:

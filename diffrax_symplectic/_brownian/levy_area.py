@@ -206,25 +206,27 @@ def _bridge_area(
     # NumPy computes these constants, so that the program does not.
     orders = np.arange(1, num_terms + 1)
     variances = 1 / (2 * np.pi**2 * orders**2)
-    # The sums of s_r and of s_r^2 over the terms of the remainder: over all orders they are
-    # 1/12 and 1/360. With many terms, rounding could make the second one negative.
-    remainder = 1 / 12 - np.sum(variances)
-    remainder_of_squares = max(1 / 360 - np.sum(variances**2), 0)
+    # The sums of s_r and of s_r^2 over the terms of the remainder, r > num_terms: over all
+    # r they are 1/12 and 1/360. With many terms, rounding could make the second negative.
+    sum_beyond = 1 / 12 - np.sum(variances)
+    sum_of_squares_beyond = max(1 / 360 - np.sum(variances**2), 0)
     deviations = jnp.asarray(np.sqrt(variances), H.dtype)
     groups = _in_groups(normals, m, num_terms)
     a = deviations * groups.cosines.reshape(m, num_terms)
     b = deviations * groups.sines.reshape(m, num_terms)
-    sum_of_all = jnp.sum(a, axis=1) + np.sqrt(remainder) * groups.remainder_sums
-    a = _with_integral(H, a, sum_of_all, variances)
-    series = _weighted_product(a, b, np.pi * orders)
-    # Cosine coefficients of the remainder have mean -12 s_r H, which gives the first part
-    # of its area, and variance s_r - 12 s_r^2, which gives the second. Since (pi r)^2 s_r
-    # is 1/2, the variances of these parts are sums of 144 s_r^2 / 2 and of s_r - 12 s_r^2.
-    mean_part = jnp.outer(H, np.sqrt(72 * remainder_of_squares) * groups.mean_parts)
-    deviation = np.sqrt(remainder - 12 * remainder_of_squares)
-    # As in the formula, the second product of each area is the transpose of the first.
-    first_products = series - mean_part
-    first_products += deviation * _strictly_upper(groups.deviation_parts, m)
+    sum_of_all = jnp.sum(a, axis=1) + np.sqrt(sum_beyond) * groups.remainder_sums
+    a_given_H = _with_integral(H, a, sum_of_all, variances)
+    series = _weighted_product(a_given_H, b, np.pi * orders)
+    # Given H, cosine coefficients of the remainder have the mean -12 s_r H, which gives the
+    # first part of its area, and the variance s_r - 12 s_r^2, which gives the second. Since
+    # (pi r)^2 s_r is 1/2, the variances of these parts are sums of 144 s_r^2 / 2 and of
+    # s_r - 12 s_r^2.
+    mean_part = jnp.outer(H, np.sqrt(72 * sum_of_squares_beyond) * groups.mean_parts)
+    deviation = np.sqrt(sum_beyond - 12 * sum_of_squares_beyond)
+    without_deviation = series - mean_part
+    deviation_part = deviation * _strictly_upper(groups.deviation_parts, m)
+    # The products a_kr b_lr of the area. The other ones, b_kr a_lr, are their transpose.
+    first_products = without_deviation + deviation_part
     return first_products - first_products.T
 
 
@@ -235,11 +237,15 @@ def _with_integral(
     variances: np.ndarray,
 ) -> Float[Array, "m terms"]:
     """The cosine coefficients `a` of these variances in `_bridge_area`, changed so that the
-    integral is `H`. `sum_of_all` is their sum before, with all coefficients beyond."""
-    # The integral is `H` if the sum is -H. Of the difference, each coefficient takes a
-    # share in proportion to its variance, s_r / (1/12).
+    integral of the bridge is `H`. `sum_of_all` is the sum of `a` and of all coefficients
+    beyond."""
+    # The integral is `H` if the sum is -H. So the coefficients must lose the excess, sum
+    # plus H. Each loses a share in proportion to its variance, s_r over the sum of all
+    # variances, which is 1/12: this is how to condition independent Gaussian variables on
+    # their sum.
     shares = jnp.asarray(12 * variances, H.dtype)
-    return a - shares * (sum_of_all + H)[:, None]
+    excess = sum_of_all + H
+    return a - shares * excess[:, None]
 
 
 def _weighted_product(

@@ -185,17 +185,17 @@ def _inverse_power_of_two(x: Array) -> tuple[Array, Integer[Array, ""]]:
     `jnp.ldexp` would take as long as a random word."""
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(x, f"int{info.bits}")
-    # The number is positive, so above its mantissa is only the exponent, which is stored
-    # with an offset, the bias: `x` lies between `2^(biased - bias)` and twice that.
-    biased = bits >> info.nmant
+    # The bits of `x = 2^k (1 + m)` with `0 <= m < 1` are a sign of zero, the number
+    # `k + bias`, and the mantissa `m`.
+    k_plus_bias = bits >> info.nmant
     bias = 2 ** (info.nexp - 1) - 1
-    # With a mantissa of zeros, an exponent stands for a power of two: this one for
-    # `2^(bias - biased)`, which is one over the largest power of two up to `x`. Times two,
-    # it is one over half of that power, which is `2^-e`.
-    inverse = lax.bitcast_convert_type((2 * bias - biased) << info.nmant, x.dtype) * 2
-    exponent = biased.astype(jnp.int32) - (bias + 1)
+    # `2^-k` has the number `-k + bias` and a mantissa of zeros. Since `2^e` is half of
+    # `2^k`, its inverse is twice `2^-k`.
+    bits_of_inverse = (2 * bias - k_plus_bias) << info.nmant
+    inverse = lax.bitcast_convert_type(bits_of_inverse, x.dtype) * 2
+    exponent = k_plus_bias.astype(jnp.int32) - (bias + 1)
     # For an empty step, in which a path has no noise, any unit will do.
-    return jnp.where(biased > 0, inverse, 1), exponent
+    return jnp.where(k_plus_bias > 0, inverse, 1), exponent
 
 
 class AbstractLaw(abc.ABC):
@@ -226,8 +226,9 @@ class Discrete(AbstractLaw):
     def from_words(self, words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
         values = [np.asarray(value, dtype) for value in self.values]
         sample = jnp.full(words.shape, values[-1])
-        # Each cut decides for all words below it, so the last cut comes first. A table of
-        # values would need a gather, which is slow on CPUs.
+        # Each selection sets the values of all words below its cut, and overwrites earlier
+        # ones. So the largest cut comes first: in the end a word has the value of the
+        # lowest cut above it. A table of values would need a gather, which is slow on CPUs.
         for cut, value in zip(reversed(self.cuts), reversed(values[:-1])):
             sample = jnp.where(words < np.uint32(cut), value, sample)
         return sample
@@ -245,7 +246,7 @@ class Gaussian(AbstractLaw):
 
     def from_words(self, words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
         sample = normal_from_words(words, dtype)
-        # A product with one would stay in the program.
+        # XLA would not remove a product with one.
         if self.variance == 1:
             return sample
         return sample * np.asarray(np.sqrt(self.variance), dtype)
@@ -273,8 +274,9 @@ def normal_from_words(words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]
     unit = np.asarray(2.0**-31, dtype)
     # Processors convert signed integers to floats faster than unsigned ones.
     signed = lax.bitcast_convert_type(words ^ np.uint32(2**31), np.int32)
-    # 2 q with its sign, and 2 p: each is accurate where the other is not. Half a unit more
-    # is the middle of the interval.
+    # With p and q as above, 2 q with its sign, which is accurate where q is near zero; and
+    # 2 p, which is accurate in the tails, where p is near zero. Half a unit more is the
+    # middle of the interval.
     two_q = (signed.astype(dtype) + half) * unit
     tail = lax.bitcast_convert_type(jnp.minimum(words, ~words), np.int32)
     two_p = (tail.astype(dtype) + half) * unit

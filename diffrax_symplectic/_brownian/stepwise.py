@@ -51,7 +51,8 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
             ends = (jnp.asarray(jnp.zeros_like(t0)), jnp.asarray(t0))
         else:
             ends = (jnp.asarray(t0), jnp.asarray(t1))
-        # Words are an integer function of the times: a derivative would silently be zero.
+        # The words are integers computed from the times, so that JAX would silently take
+        # the derivative with respect to the times for zero.
         start, end = cast(tuple[Array, Array], nondifferentiable(ends, name="t"))
         # As a program of its own, which is traced once for all steps of a solve.
         return _draw_increment(self, start, end, use_levy)
@@ -252,7 +253,8 @@ def increment_struct(
     """The shapes and dtypes of an increment, in its structure."""
     if isinstance(path, UnspecifiedPath):
         return path.shape
-    # With times as in a solve, both share the trace of `evaluate`.
+    # Times have the dtype that they have in a solve, where the trace of `evaluate` that is
+    # made here is used again.
     time = jax.ShapeDtypeStruct((), jnp.result_type(float))
     return jax.eval_shape(lambda *ends: path.evaluate(*ends), time, time)
 

@@ -78,7 +78,8 @@ class RandomVariable(NamedTuple):
         return f"{self.name}. Make its path by `solver.path(shape, key)`"
 
 
-# Two variables of one increment each, which differ in their laws and uses.
+# `H` and `L` are variables of the same increment and path, and so are `C` and `sign`: these
+# functions make their records, given in what the two differ.
 _area = ft.partial(
     RandomVariable,
     increment=diffrax.AbstractSpaceTimeLevyArea,

@@ -151,14 +151,14 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         return 0
 
     def own_increment(self, increment, own_words, h, use_levy) -> Increment:
-        h = jnp.abs(h)
-        h_in_units = h
+        length = jnp.abs(h)
+        length_in_units = length
         if self.unit is not None:
-            h_in_units = h / jnp.asarray(self.unit, h.dtype)
-        h_in_units = eqx.error_if(h_in_units, h_in_units >= 1, STEP_BEYOND_UNIT)
-        # The bound of an empty step is zero.
-        log_h_in_units = jnp.log(jnp.where(h_in_units > 0, h_in_units, 1))
-        bound = jnp.sqrt(2 * self.k * h * jnp.abs(log_h_in_units))
+            length_in_units = length / jnp.asarray(self.unit, length.dtype)
+        checked = eqx.error_if(length_in_units, length_in_units >= 1, STEP_BEYOND_UNIT)
+        # The logarithm of 1 is zero, and so is the bound of an empty step.
+        log_length_in_units = jnp.log(jnp.where(checked > 0, checked, 1))
+        bound = jnp.sqrt(2 * self.k * length * jnp.abs(log_length_in_units))
 
         def clip(w: Array) -> Array:
             return jnp.clip(w, -bound.astype(w.dtype), bound.astype(w.dtype))
@@ -177,19 +177,21 @@ def _may_be_positive(unit: Any) -> bool:
 
 def lost_variance(path: diffrax.AbstractBrownianPath, h: float) -> float:
     """The share of the variance of an increment over a step of size `h` that is lost by
-    truncation."""
+    truncation. If wrappers truncate several times, the largest share of one of them."""
     share = 0.0
-    while isinstance(path, AbstractWrappedPath):
-        if isinstance(path, TruncatedBrownianPath):
-            # In units of the root of `h`; zero for steps of a `unit` and longer.
-            unit = 1.0 if path.unit is None else float(path.unit)
-            bound = math.sqrt(2 * path.k * max(-math.log(h / unit), 0))
-            share = max(share, _variance_beyond(bound))
-        path = path.path
+    remaining = path
+    while isinstance(remaining, AbstractWrappedPath):
+        if isinstance(remaining, TruncatedBrownianPath):
+            # The bound in standard deviations, `A_h` in the docstring of the class; zero
+            # for steps of a `unit` and longer, of which nothing is left.
+            unit = 1.0 if remaining.unit is None else float(remaining.unit)
+            bound = math.sqrt(2 * remaining.k * max(-math.log(h / unit), 0))
+            share = max(share, _variance_lost_beyond(bound))
+        remaining = remaining.path
     return share
 
 
-def _variance_beyond(bound: float) -> float:
+def _variance_lost_beyond(bound: float) -> float:
     """`1 - E[min(|x|, bound)^2]` for a standard normal `x`, by partial integration of
     `x^2 - bound^2` over both tails."""
     density = math.exp(-(bound**2) / 2) / math.sqrt(2 * math.pi)

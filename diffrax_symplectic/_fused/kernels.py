@@ -29,7 +29,7 @@ from .program import as_numbers, entry_kinds, pack, Program, shapes_of, unpack
 
 
 # Kernels of systems with more numbers in their state take long to compile.
-_MOST_NUMBERS = 256
+_MOST_NUMBERS_IN_STATE = 256
 # Kernels of more operations compile for longer than programs of JAX. The stage equations of
 # 64 rods, 20,000 operations, compile for 4.3 s, by JAX for 5.2 s; a loop of linear systems,
 # 53,000 operations, for 16 s, by JAX for 4.9 s.
@@ -41,13 +41,15 @@ _MOST_RECORDINGS = 100
 class Lanes(NamedTuple):
     """The paths of a batch. Each Dr.Jit array has one lane for each path.
 
-    - `own_arrays`: the words of the random keys, and the entries of the paths' own `args`.
+    - `keys`: the words of the random keys.
+    - `own_args`: the entries of the arrays in `args` that each path has of its own.
     - `y`: the entries of the states.
     - `solver_state`: the entries of the solver states that steps change.
     - `stopped`: whether a step of the path was not solved.
     """
 
-    own_arrays: list[Any]
+    keys: list[Any]
+    own_args: list[Any]
     y: list[Any]
     solver_state: list[Any]
     stopped: Any
@@ -76,7 +78,7 @@ class Kernels:
         arrays = functions.arrays
         key = functions.key
         keys = jax.eval_shape(functions.path_keys, arrays, key, word, word)
-        own_arrays = [*keys, *functions.own_args]
+        own_args = [*functions.own_args]
         y = jax.eval_shape(functions.y0, arrays)
         _check_size(sum(x.size for x in y))
         self._path_keys = Program(
@@ -87,11 +89,12 @@ class Kernels:
             functions.step,
             dict(
                 arrays=arrays,
-                own_arrays=own_arrays,
+                keys=keys,
+                own_args=own_args,
                 h=jax.ShapeDtypeStruct((), jnp.result_type(*y)),
                 i=jax.ShapeDtypeStruct((), "int32"),
                 y=y,
-                solver_state=jax.eval_shape(functions.start, arrays, own_arrays, y),
+                solver_state=jax.eval_shape(functions.start, arrays, keys, own_args, y),
             ),
         )
         self._is_moving = self._moving_arrays()
@@ -110,7 +113,8 @@ class Kernels:
         # The results of a step are the state, the solver state, and whether it succeeded.
         first_result = len(self._step.types["y"])
         returned = self._step.replay.returned_arguments
-        # For each array of the new solver state, the number of the argument that it is.
+        # For each array of the new solver state, the number of the argument that the step
+        # returns as this array, or `None` if it computes the array.
         sources = returned[first_result : first_result + num_arrays]
         return [
             self._functions.paths_differ or source != first_argument + k
@@ -128,7 +132,7 @@ class Kernels:
             def start_of_numbered_path(low: Array) -> list[Array]:
                 high = jnp.zeros_like(low)
                 keys = self._functions.path_keys(arrays, key, high, low)
-                return self._functions.start(arrays, [*keys, *own_args], y)
+                return self._functions.start(arrays, keys, own_args, y)
 
             # No solver draws random numbers in `init`, so the number of a path does not
             # matter. With `out_axes=None`, JAX raises an error if the result depends on it.
@@ -167,10 +171,11 @@ class Kernels:
         solver_state = self._compiled_solver_state(arrays, key, y_leaves, args_leaves)
         moving = elements_where(solver_state, self._is_moving)
         fixed = elements_where(solver_state, self._is_fixed)
-        args_entries = self._in_lanes(self._types_of_own_args, args_leaves, num_paths)
+        types = self._step.types
         lanes = Lanes(
-            own_arrays=[*keys, *args_entries],
-            y=self._in_lanes(self._step.types["y"], y_leaves, num_paths),
+            keys=keys,
+            own_args=self._in_lanes(types["own_args"], args_leaves, num_paths),
+            y=self._in_lanes(types["y"], y_leaves, num_paths),
             solver_state=self._in_lanes(self._types_of_moving, moving, num_paths),
             stopped=dr.opaque(kinds["i1"], False, num_paths),
         )
@@ -186,7 +191,7 @@ class Kernels:
         y, solver_state, stopped = self._take_steps(
             *shared, opaque(first_step), opaque(end_step), *lanes
         )
-        return Lanes(lanes.own_arrays, y, solver_state, stopped)
+        return lanes._replace(y=y, solver_state=solver_state, stopped=stopped)
 
     def _in_lanes(
         self, types: list[ArrayType], arrays: list[Array], num_paths: int
@@ -211,14 +216,6 @@ class Kernels:
     @property
     def _types_for_keys(self) -> list[ArrayType]:
         return [*self._path_keys.types["arrays"], *self._path_keys.types["key"]]
-
-    @property
-    def _types_of_own_args(self) -> list[ArrayType]:
-        # Of the arrays that each path has of its own, the keys come first, and then those
-        # of `args`.
-        types = self._step.types["own_arrays"]
-        num_keys = len(types) - len(self._functions.own_args)
-        return types[num_keys:]
 
     @property
     def _types_of_shared(self) -> list[ArrayType]:
@@ -247,16 +244,18 @@ class Kernels:
         constants: list[Any],
         first_step: Any,
         end_step: Any,
-        own_arrays: list[Any],
+        keys: list[Any],
+        own_args: list[Any],
         y: list[Any],
         solver_state: list[Any],
         stopped: Any,
     ) -> tuple[list[Any], list[Any], Any]:
         """The state, the solver state and which paths stopped after the steps `first_step`
-        to `end_step - 1`, from those before, as Dr.Jit records the loop over steps."""
+        to `end_step - 1`, as Dr.Jit records the loop over steps. The arguments are the
+        fields of `Shared`, the numbers of the steps, and the fields of `Lanes`."""
         select = drjit().select
         # Dr.Jit numbers its variables one after another, one for each operation. So the
-        # number of this variable and of the last one below count the operations between.
+        # difference between this number and the last one below counts the operations.
         first_variable = variable_number(first_step + 1)
         step = self._step
         # In the order in which `lanes_and_shared` packs them: the arrays of the system, the
@@ -265,7 +264,8 @@ class Kernels:
         shared = unpack(self._types_of_shared, packed)
         arrays = shared[:num_arrays]
         h, *fixed = shared[num_arrays:]
-        own_tensors = tensors_from(own_arrays, shapes_of(step.types["own_arrays"]))
+        key_tensors = tensors_from(keys, shapes_of(step.types["keys"]))
+        args_tensors = tensors_from(own_args, shapes_of(step.types["own_args"]))
         shapes_of_y = shapes_of(step.types["y"])
         shapes_of_moving = shapes_of(self._types_of_moving)
 
@@ -280,13 +280,16 @@ class Kernels:
             whole_solver_state = elements_of_both(self._is_moving, moving, fixed)
             results, error_masks = step.replay(
                 *arrays,
-                *own_tensors,
+                *key_tensors,
+                *args_tensors,
                 h,
                 scalar(i),
                 *y_tensors,
                 *whole_solver_state,
                 constants=constants,
             )
+            # The arrays of the state, those of the solver state, and whether the step
+            # succeeded, as in `Stepped`.
             *states, success = results
             # The order decides how LLVM schedules operations: with the success first, a
             # step of `StormerVerlet` in single precision takes 1.13 times as long, and of
@@ -325,8 +328,8 @@ def _warn_of_operations(num_operations: int) -> None:
 
 def _check_size(num_numbers: int) -> None:
     """Raises a `ValueError` for states of more numbers than kernels take."""
-    if num_numbers > _MOST_NUMBERS:
+    if num_numbers > _MOST_NUMBERS_IN_STATE:
         raise ValueError(
-            f'`engine="drjit"` takes states of up to {_MOST_NUMBERS} numbers; got '
-            f'{num_numbers}. Pass `engine="jax"`.'
+            f'`engine="drjit"` takes states of up to {_MOST_NUMBERS_IN_STATE} '
+            f'numbers; got {num_numbers}. Pass `engine="jax"`.'
         )

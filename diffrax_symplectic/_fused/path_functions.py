@@ -61,12 +61,13 @@ class PathFunctions(NamedTuple):
     """A system without the values of its arrays, as functions of these values. Hashable: it
     is what a kernel is compiled for.
 
-    In these functions `arrays` are the arrays of the system, and `own_arrays` those that
-    each path has of its own: the words of its random keys, followed by the arrays of its
-    `args` if these are drawn.
+    In these functions `arrays` are the arrays of the system. Each path has `keys` of its
+    own, the words of the random keys in its terms; and if its `args` are drawn, `own_args`,
+    the arrays in them, of which there are none otherwise.
 
-    - `treedef`, `static`, `structs`: the system. Where it has an array, `static` is `None`
-        and `structs` has its shape and type.
+    - `treedef`, `static`, `structs`: the structure of the system, and two entries for each
+        of its leaves. For an array, `static` has `None` and `structs` its shape and type;
+        for any other leaf, `static` has the leaf and `structs` has `None`.
     - `impl`: the implementation of random keys.
     - `own_args`: the shapes of the arrays of `args` that each path has of its own.
     - `paths_differ`: whether each path has its own initial state and `args`.
@@ -113,45 +114,52 @@ class PathFunctions(NamedTuple):
         return path_keys(self.system(arrays).terms, sample_key(key, high, low))
 
     def start(
-        self, arrays: list[Array], own_arrays: list[Array], y: list[Array]
+        self,
+        arrays: list[Array],
+        keys: list[Array],
+        own_args: list[Array],
+        y_leaves: list[Array],
     ) -> list:
-        """The leaves of the state of the solver before the first step of a path from
-        `y`."""
-        system, terms = self._system_and_terms(arrays, own_arrays)
-        y = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
-        # No solver's initial state depends on the size of a step.
-        h = jnp.ones((), jnp.result_type(*jtu.tree_leaves(y)))
+        """The leaves of the state of the solver before the first step of a path, from those
+        of its initial state."""
+        system, terms = self._system_and_terms(arrays, keys, own_args)
+        y = jtu.tree_unflatten(jtu.tree_structure(system.y0), y_leaves)
+        # Any size of the first step will do: no solver's initial state depends on it.
+        h = jnp.ones((), jnp.result_type(*y_leaves))
         return jtu.tree_leaves(system.init(terms, 0, h, y))
 
     def step(
-        self, arrays, own_arrays, h, i, y: list[Array], solver_state: list[Array]
+        self,
+        arrays: list[Array],
+        keys: list[Array],
+        own_args: list[Array],
+        h: Array,
+        i: Array,
+        y_leaves: list[Array],
+        solver_leaves: list[Array],
     ) -> Stepped:
-        """A path after step number `i` of size `h`, from the leaves of its state `y` and of
-        the solver's state."""
-        system, terms = self._system_and_terms(arrays, own_arrays)
+        """A path after step number `i` of size `h`, from the leaves of its state and of the
+        solver's state."""
+        system, terms = self._system_and_terms(arrays, keys, own_args)
         # `init` is traced and not run: only the structure of the solver's state is needed.
         solver_struct = eqx.filter_eval_shape(system.init, terms, 0, h, system.y0)
-        y = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
-        solver_state = jtu.tree_unflatten(
-            jtu.tree_structure(solver_struct), solver_state
-        )
-        y, solver_state, success = system.step(terms, i, h, y, solver_state)
-        return Stepped(jtu.tree_leaves(y), jtu.tree_leaves(solver_state), success)
+        solver_treedef = jtu.tree_structure(solver_struct)
+        y0 = jtu.tree_unflatten(jtu.tree_structure(system.y0), y_leaves)
+        state0 = jtu.tree_unflatten(solver_treedef, solver_leaves)
+        y1, state1, success = system.step(terms, i, h, y0, state0)
+        return Stepped(jtu.tree_leaves(y1), jtu.tree_leaves(state1), success)
 
     def _system_and_terms(
-        self, arrays: list[Array], own_arrays: list[Array]
+        self, arrays: list[Array], keys: list[Array], own_args: list[Array]
     ) -> tuple[SteppedSystem, PyTree]:
         """The system with the `args` of a path, and its terms with the keys of the path.
         (The terms within the system keep the keys of the system.)"""
         system = self.system(arrays)
-        # The keys come first, and then the arrays of `args`, as `Kernels` joins them.
-        num_keys = len(own_arrays) - len(self.own_args)
-        keys = own_arrays[:num_keys]
-        own_args = None
-        if self.own_args:
+        args_or_none = None
+        if len(own_args) > 0:
             treedef = jtu.tree_structure(eqx.filter(system.args, eqx.is_array))
-            own_args = jtu.tree_unflatten(treedef, own_arrays[num_keys:])
-        return system.with_args(own_args), with_keys(system.terms, keys)
+            args_or_none = jtu.tree_unflatten(treedef, own_args)
+        return system.with_args(args_or_none), with_keys(system.terms, keys)
 
 
 def sample_key(key: PRNGKeyArray, high, low) -> PRNGKeyArray:

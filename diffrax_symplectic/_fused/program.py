@@ -74,8 +74,9 @@ def shapes_of(types: Iterable[ArrayType]) -> list[tuple[int, ...]]:
 def pack(
     types: Sequence[ArrayType], arrays: Iterable[Array | np.ndarray]
 ) -> dict[str, Any]:
-    """The entries of all these arrays, which all paths share, in one array of Dr.Jit for
-    each kind of number: a kernel takes few arguments."""
+    """The entries of all these arrays, which all paths share, one array after another, in
+    one array of Dr.Jit for each kind of number, such as `f64`: a kernel takes few
+    arguments."""
     rows: dict[str, list[np.ndarray]] = {array_type.kind: [] for array_type in types}
     for array_type, x in zip(types, arrays, strict=True):
         rows[array_type.kind].append(as_numbers(x).ravel())
@@ -88,14 +89,15 @@ def pack(
 def unpack(types: Sequence[ArrayType], packed: dict[str, Any]) -> list[Tensor]:
     """The inverse of `pack`, within a kernel."""
     # For each kind, the number of entries that belong to the arrays before.
-    num_used = dict.fromkeys(packed, 0)
+    num_before = dict.fromkeys(packed, 0)
     tensors = []
     for array_type in types:
         kind = array_type.kind
-        places = num_used[kind] + np.arange(array_type.size)
-        num_used[kind] += array_type.size
-        table = Table(packed[kind], places)
-        # Small arrays are read once, before the loop over steps.
+        addresses = num_before[kind] + np.arange(array_type.size)
+        num_before[kind] += array_type.size
+        table = Table(packed[kind], addresses)
+        # Entries of small arrays are read here, before the loop over steps, and those of
+        # large ones where a step asks for them.
         entries = table if array_type.size > MOST_IN_REGISTERS else [*table]
         tensors.append(Tensor(entries, array_type.shape))
     return tensors

@@ -36,10 +36,10 @@ from .._solver import with_changed_stages
 _MOST_SWEEPS = 48
 # Sweeps diverge if a correction is larger than this, in units of the tolerance. (The number
 # is finite in single precision, too.)
-_HUGE = 1e30
-# Sweeps that diverge may have an infinite rate, the ratio of two corrections. Rates beyond
-# this one are relaxed as this one is.
-_FASTEST_GROWTH = 4
+_DIVERGED = 1e30
+# The rate is the ratio of two corrections, which may be infinite where sweeps diverge. The
+# relaxation is chosen for at most this rate.
+_LARGEST_RATE = 4
 
 
 class _Equations(NamedTuple):
@@ -61,10 +61,12 @@ class _Equations(NamedTuple):
     def sweep(self, y: Halves, relaxation: Scalar | None = None) -> Halves:
         """The iterate after a sweep, in which $q$ reads the new $p$. Without a `relaxation`
         this takes fewer operations than with a relaxation of one."""
-        new_p = self.image(y).p if self.in_halves else self.image(y.q)
-        y = Halves(_relaxed(new_p, y.p, relaxation), y.q)
-        new_q = self.image(y).q if self.in_halves else self.image(y.p)
-        return Halves(y.p, _relaxed(new_q, y.q, relaxation))
+        unrelaxed_p = self.image(y).p if self.in_halves else self.image(y.q)
+        with_new_p = Halves(_relaxed(unrelaxed_p, y.p, relaxation), y.q)
+        unrelaxed_q = (
+            self.image(with_new_p).q if self.in_halves else self.image(with_new_p.p)
+        )
+        return Halves(with_new_p.p, _relaxed(unrelaxed_q, y.q, relaxation))
 
     def value(self, y: Halves) -> PyTree[Array]:
         """The unknowns of an iterate."""
@@ -107,11 +109,12 @@ class _Criterion(NamedTuple):
         tolerance, and whether sweeps have converged."""
         sizes = _sizes(correction)
         size = _largest([x * weight for x, weight in zip(sizes, self.weights)])
-        # The next correction is expected to be `size * (size / size_before)`, and compared
-        # with the tolerance over a margin, here without a division. If corrections grow,
-        # the ratio says nothing, and counts as one.
-        smaller = jnp.where(size < size_before, size, size_before)
-        is_next_small = 2.0**LOG2_MARGIN * size * smaller <= size_before
+        # The next correction is expected to be `size * ratio` with the last ratio, `size /
+        # size_before`. If corrections grow, the ratio says nothing, and counts as one. So
+        # the condition is `2^LOG2_MARGIN * size * min(ratio, 1) <= 1`, and here both sides
+        # are multiplied by `size_before`, since a division takes long.
+        ratio_times_size_before = jnp.where(size < size_before, size, size_before)
+        is_next_small = 2.0**LOG2_MARGIN * size * ratio_times_size_before <= size_before
         # Rounding errors do not shrink any further.
         is_stalled = size >= 2.0**LOG2_STALLED * size_before
         is_rounding = _largest(sizes) <= self.rounding
@@ -162,7 +165,7 @@ def solve_one_path(
     # as long as a sweep.
     relaxation = lax.cond(
         size > SLOW * size_before,
-        lambda: best_relaxation(jnp.minimum(size / size_before, _FASTEST_GROWTH)),
+        lambda: best_relaxation(jnp.minimum(size / size_before, _LARGEST_RATE)),
         lambda: one,
     )
 
@@ -174,7 +177,7 @@ def solve_one_path(
 
     def goes_on(state: _SweepState) -> Bool[Array, ""]:
         may_sweep = state.num_sweeps < _MOST_SWEEPS
-        return ~state.is_solved & may_sweep & (state.size < _HUGE)
+        return ~state.is_solved & may_sweep & (state.size < _DIVERGED)
 
     # A path that is not pending counts as solved, and sweeps no more.
     counts_as_solved = ~pending | is_solved
@@ -204,8 +207,8 @@ def _inverse(x: Scalar) -> Scalar:
     # Shifts there and back set the mantissa to zero: a power of two is left.
     bits_of_one = int(np.asarray(1, x.dtype).view(integer))
     bits_of_power = lax.bitcast_convert_type(x, integer) >> info.nmant << info.nmant
-    # Exponents are stored with an offset, that of one. Twice the offset minus the stored
-    # exponent of 2^k is the stored exponent of 2^-k.
+    # The exponent of 2^k is stored as `k + offset`, and thus that of one as the offset. So
+    # twice the bits of one minus those of 2^k are those of 2^-k.
     inverse = jnp.asarray(2 * bits_of_one, integer) - bits_of_power
     return lax.bitcast_convert_type(inverse, x.dtype)
 
@@ -244,11 +247,13 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
-        return state[1], optx.RESULTS.successful
+        _, is_solved = state
+        return is_solved, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del fn, y, args, options, tags, result
-        return state[0], aux, {}
+        solution, _ = state
+        return solution, aux, {}
 
 
 def by_sweeps_alone(solver: Any) -> Any:

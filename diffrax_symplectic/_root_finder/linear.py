@@ -194,9 +194,10 @@ def _clear_column(k: IntScalarLike, rows: Float[Array, "n m"]) -> Float[Array, "
     sizes = jnp.where(row_numbers < k, -1, jnp.abs(rows[:, k]))
     pivot_number = jnp.argmax(sizes)
     pivot_row = rows[pivot_number] / rows[pivot_number, k]
-    # Row `k` takes the place of the pivot's row, whose own place is set in the last line.
-    # Rows are replaced by selections, which the fused engine replays. It does not replay a
-    # scatter to a row that differs between paths.
-    rows = jnp.where((row_numbers == pivot_number)[:, None], rows[k], rows)
-    cleared = rows - rows[:, k, None] * pivot_row
+    # To exchange the two rows, row `k` is written to the place of the pivot's row here, and
+    # the pivot's row to place `k` in the last line. Rows are replaced by selections, which
+    # the fused engine replays. It does not replay a scatter to a row that differs between
+    # paths.
+    with_row_k = jnp.where((row_numbers == pivot_number)[:, None], rows[k], rows)
+    cleared = with_row_k - with_row_k[:, k, None] * pivot_row
     return jnp.where((row_numbers == k)[:, None], pivot_row, cleared)

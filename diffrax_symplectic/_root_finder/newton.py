@@ -21,26 +21,27 @@ _Vector: TypeAlias = Float[Array, " n"]
 
 # The number of iterations for the whole step after which corrections must shrink. From a
 # poor guess the first few may grow although the method converges.
-_PATIENCE = 8
-# The same for a part of the step, which starts near a solution: there Newton's method
-# converges soon or not at all.
-_PATIENCE_IN_PART = 4
+_MAY_GROW_IN_WHOLE_STEP = 8
+# In a part of the step, corrections must shrink as soon as there are two to compare.
+_MAY_GROW_IN_PART = 2
+# The most iterations for a part of the step, which starts near a solution: there Newton's
+# method converges soon or not at all.
+_MOST_IN_PART = 4
 # A correction makes progress if it is below this fraction of the previous one.
-_SHRINK = 0.5
+_SHRINKAGE_OF_PROGRESS = 0.5
 # A part of the step is solved once corrections are below this fraction of the iterate. It
 # only serves as the guess for the next part.
-_LOOSE = 0.1
+_TOLERANCE_OF_PART = 0.1
 # Near a solution Newton's method converges quadratically. Corrections there that are above
 # this fraction of the previous one have reached rounding errors.
-_SHRINK_AT_ROUNDING = 0.25
-# Two corrections are the fewest that can be compared.
-_FEWEST_TO_COMPARE = 2
+_SHRINKAGE_AT_ROUNDING = 0.25
 # The next part is twice as long after a success, and a quarter as long after a failure.
-_LONGER = 2.0
-_SHORTER = 0.25
-# When parts get this short, the branch of solutions from the start of the step has turned
-# back: the step has no solution on it. Solutions on other branches are no steps.
-_SHORTEST = 1e-3
+_FACTOR_AFTER_SUCCESS = 2.0
+_FACTOR_AFTER_FAILURE = 0.25
+# When parts, as fractions of the step, get this short, the branch of solutions from the
+# start of the step has turned back: the step has no solution on it. Solutions on other
+# branches are no steps.
+_SHORTEST_PART = 1e-3
 
 
 class Progress(NamedTuple):
@@ -51,7 +52,7 @@ class Progress(NamedTuple):
     - `anchor`: the approximate solution at `reached`.
     - `reached`, `target`: the last $s$ solved, and the $s$ being solved for.
     - `tries`: the number of iterations for this target.
-    - `size`: the last correction, in units of the tolerance.
+    - `size`: the size of the last correction, in units of the tolerance.
     - `is_solved`: whether the full equations are solved.
     - `has_turned_back`: whether the branch of solutions from $s = 0$ ends before $s = 1$.
     """
@@ -136,12 +137,12 @@ class Newton(eqx.Module):
             log2(size),
             log2(shrinkage),
             correction_size.is_rounding,
-            has_stalled=shrinkage >= _SHRINK_AT_ROUNDING,
+            has_stalled=shrinkage >= _SHRINKAGE_AT_ROUNDING,
         )
         size_of_iterate = max_norm(k)
         is_correct = self._is_correct(newton, next_k, scale, size_of_iterate)
         is_solved = has_converged & is_whole_step & is_correct
-        is_near = max_norm(newton.change) < _LOOSE * size_of_iterate
+        is_near = max_norm(newton.change) < _TOLERANCE_OF_PART * size_of_iterate
         part_is_solved = is_near & ~is_whole_step
         progress = progress._replace(
             tries=progress.tries + 1, size=size, is_solved=is_solved
@@ -173,13 +174,13 @@ def _cannot_go_on(progress: Progress, shrinkage: Scalar) -> Bool[Array, ""]:
     not finite, is not smaller than the one before by enough, or is one of too many."""
     is_whole_step = progress.target == 1
     # The whole step at once is tried first, from a guess that may be poor. The last part of
-    # a continuation begins near a solution, or fails soon.
+    # a continuation has the same target, but begins near a solution, or fails soon.
     is_first_try = is_whole_step & (progress.reached == 0)
-    patience = jnp.where(is_first_try, _PATIENCE, _FEWEST_TO_COMPARE)
+    num_may_grow = jnp.where(is_first_try, _MAY_GROW_IN_WHOLE_STEP, _MAY_GROW_IN_PART)
     # A zero correction away from a solution is no progress either.
-    makes_progress = (shrinkage < _SHRINK) & (progress.size > 0)
-    has_stopped = (progress.tries >= patience) & ~makes_progress
-    is_slow = ~is_whole_step & (progress.tries >= _PATIENCE_IN_PART)
+    makes_progress = (shrinkage < _SHRINKAGE_OF_PROGRESS) & (progress.size > 0)
+    has_stopped = (progress.tries >= num_may_grow) & ~makes_progress
+    is_slow = ~is_whole_step & (progress.tries >= _MOST_IN_PART)
     return ~jnp.isfinite(progress.size) | has_stopped | is_slow
 
 
@@ -194,16 +195,16 @@ def _next_target(
     if Newton's method `has_failed`; and otherwise the same."""
     target = progress.target
     stride = progress.target - progress.reached
-    longer = jnp.minimum(target + _LONGER * stride, 1)
-    shorter = progress.reached + _SHORTER * stride
-    k = jnp.where(has_failed, progress.anchor, k)
-    anchor = jnp.where(part_is_solved, k, progress.anchor)
+    further = jnp.minimum(target + _FACTOR_AFTER_SUCCESS * stride, 1)
+    nearer = progress.reached + _FACTOR_AFTER_FAILURE * stride
+    next_k = jnp.where(has_failed, progress.anchor, k)
+    anchor = jnp.where(part_is_solved, next_k, progress.anchor)
     reached = jnp.where(part_is_solved, target, progress.reached)
-    same_or_shorter = jnp.where(has_failed, shorter, target)
-    return k, progress._replace(
+    same_or_nearer = jnp.where(has_failed, nearer, target)
+    return next_k, progress._replace(
         anchor=anchor,
         reached=reached,
-        target=jnp.where(part_is_solved, longer, same_or_shorter),
+        target=jnp.where(part_is_solved, further, same_or_nearer),
         tries=jnp.where(part_is_solved | has_failed, 0, progress.tries),
-        has_turned_back=has_failed & (_SHORTER * stride < _SHORTEST),
+        has_turned_back=has_failed & (_FACTOR_AFTER_FAILURE * stride < _SHORTEST_PART),
     )

@@ -9,7 +9,7 @@ import jax.tree_util as jtu
 from jax import lax
 from jaxtyping import Array, Bool, PyTree, Scalar
 
-from .._batch import batched_like, materialize, most_of_batch
+from .._batch import batched_like, largest_in_batch, materialize
 from .._compat import ω
 from .._custom_types import IntScalarLike
 from .tolerance import converged, CorrectionSize, log2, LOG2_MARGIN, Tolerance
@@ -56,7 +56,8 @@ class _SweepState(NamedTuple):
 
     - `y`: the iterate.
     - `relaxation`: the relaxation factor.
-    - `level`: the base-2 logarithm of the size of the last correction.
+    - `log2_size`: the base-2 logarithm of the size of the last correction, in units of the
+        tolerance.
     - `is_solved`: whether the last correction of the path, while it was pending, was small
         enough.
     - `pending`: whether to continue.
@@ -67,7 +68,7 @@ class _SweepState(NamedTuple):
 
     y: Halves | None
     relaxation: Scalar
-    level: Scalar
+    log2_size: Scalar
     is_solved: Bool[Array, ""]
     pending: Bool[Array, ""]
     num_done: IntScalarLike
@@ -133,12 +134,12 @@ def solve_by_sweeps(
     def sweep_and_check(state: _SweepState) -> _SweepState:
         correction, y = _sweep_until_check(image, state, in_halves)
         size = tolerance.measure(correction, scale(value_of(y)))
-        # Before the first check the level is infinite: the size of the state stands for the
-        # correction before.
-        last_level = jnp.minimum(state.level, log2(size.bound))
-        level = log2(size.size)
+        # Before the first check there is no correction to compare with, and `log2_size` is
+        # infinite: the size of the state takes its place.
+        last_log2_size = jnp.minimum(state.log2_size, log2(size.size_of_state))
+        log2_size = log2(size.size)
         check = ft.partial(
-            _decide, state, level, last_level, size, first_sweeps, max_sweeps
+            _decide, state, log2_size, last_log2_size, size, first_sweeps, max_sweeps
         )
         # Without `materialize` the result would be recomputed wherever it is used: steps of
         # small systems took 1.3 to 2.8 times as long. The logarithms are inside, so that
@@ -161,7 +162,7 @@ def solve_by_sweeps(
     state = _SweepState(
         y=start,
         relaxation=one,
-        level=inf,
+        log2_size=inf,
         is_solved=false,
         pending=pending,
         # The batch shares the counts, so that the loops keep unbatched lengths.
@@ -204,8 +205,8 @@ def _sweep_until_check(image: Map, state: _SweepState, in_halves: bool) -> _Afte
 
     if not in_halves:
         y = lax.fori_loop(0, state.num_ahead, sweep, state.y)
-        # The halves may converge to different solutions of y = \Phi(\Phi(y)). Only their
-        # difference shows that, so it serves as the correction.
+        # The halves may converge to different solutions of y = \Phi(\Phi(y)), which do not
+        # solve y = \Phi(y). Only their difference shows that: it serves as the correction.
         return _AfterSweeps((y.q**ω - y.p**ω).ω, y)
     # A loop that also carried the previous iterate would copy it in each sweep: steps of 64
     # pairs took 1.1 to 1.4 times as long, although the program was a tenth shorter.
@@ -216,54 +217,56 @@ def _sweep_until_check(image: Map, state: _SweepState, in_halves: bool) -> _Afte
 
 def _decide(
     state: _SweepState,
-    level: Scalar,
-    last_level: Scalar,
+    log2_size: Scalar,
+    last_log2_size: Scalar,
     size: CorrectionSize,
     first_sweeps: int,
     max_sweeps: int,
 ) -> _Decision:
-    """What to do next, after a correction of this `size`. Its base-2 logarithm is `level`,
-    and that of the correction at the last check is `last_level`. `first_sweeps` is the
-    number of sweeps before the first check, and `max_sweeps` the most in all."""
-    # The rate is a base-2 logarithm, so that the number of further sweeps is a quotient.
-    rate = (level - last_level) / state.num_ahead
+    """What to do next, after a correction of this `size`, whose base-2 logarithm is
+    `log2_size`. The correction at the last check had the logarithm `last_log2_size`.
+    `first_sweeps` is the number of sweeps before the first check, and `max_sweeps` the most
+    in all."""
+    # The rate is the factor by which a correction shrinks in one sweep. In logarithms it is
+    # a difference per sweep, and the number of further sweeps is a quotient.
+    log2_rate = (log2_size - last_log2_size) / state.num_ahead
     num_done = state.num_done + state.num_ahead
-    has_stalled = rate >= LOG2_STALLED
-    has_converged = converged(level, rate, size.is_rounding, has_stalled)
+    has_stalled = log2_rate >= LOG2_STALLED
+    has_converged = converged(log2_size, log2_rate, size.is_rounding, has_stalled)
     # Sweeps that diverged get one more try. If it stalls, Newton's method takes over.
     starts_again = has_stalled & (state.relaxation > _STRONGEST_RELAXATION)
-    ratio = jnp.exp2(rate)
+    rate = jnp.exp2(log2_rate)
     # The relaxation is tuned once, at the first check: later rates are those of relaxed
     # sweeps, to which the formula does not apply.
-    is_tuned_now = (state.num_done == 0) & (ratio > SLOW) & ~has_stalled
-    # After so many sweeps the level is at `-LOG2_MARGIN`.
-    num_needed = (level + LOG2_MARGIN) / jnp.where(
-        is_tuned_now, -_LOG2_RELAXED_RATE, -rate
+    is_tuned_now = (state.num_done == 0) & (rate > SLOW) & ~has_stalled
+    # After so many more sweeps, `log2_size` has come down to `-LOG2_MARGIN`.
+    num_needed = (log2_size + LOG2_MARGIN) / jnp.where(
+        is_tuned_now, -_LOG2_RELAXED_RATE, -log2_rate
     )
     # Sweeps that would not end in time end now, before they cost anything.
     in_time = starts_again | (~has_stalled & (num_done + num_needed < max_sweeps))
     pending = state.pending & ~has_converged & in_time & (num_done < max_sweeps)
     # Newton's method begins where the sweeps ended if that is near a solution, or else at
-    # the guess.
-    is_near = ~has_stalled & (size.is_small | pending)
+    # the guess. Paths that sweep on keep their iterate, too.
+    keeps_iterate = ~has_stalled & (size.is_small | pending)
     num_ahead = jnp.where(starts_again, first_sweeps, num_needed)
     # Corrections as small as rounding errors show no rate.
     num_ahead = jnp.where(
         size.is_rounding, jnp.minimum(num_ahead, _MOST_AT_ROUNDING), num_ahead
     )
     num_ahead = jnp.ceil(jnp.where(pending, num_ahead, 0)).astype(int)
-    relaxation = jnp.where(is_tuned_now, best_relaxation(ratio), state.relaxation)
+    relaxation = jnp.where(is_tuned_now, best_relaxation(rate), state.relaxation)
     next_state = _SweepState(
         y=None,
         relaxation=jnp.where(starts_again, _STRONGEST_RELAXATION, relaxation),
-        level=jnp.where(starts_again, jnp.inf, level),
+        log2_size=jnp.where(starts_again, jnp.inf, log2_size),
         is_solved=jnp.where(state.pending, has_converged, state.is_solved),
         pending=pending,
         num_done=num_done,
         # The path of the batch that needs the most sweeps decides for all.
-        num_ahead=jnp.minimum(most_of_batch(num_ahead), _MOST_BETWEEN_CHECKS),
+        num_ahead=jnp.minimum(largest_in_batch(num_ahead), _MOST_BETWEEN_CHECKS),
     )
-    return _Decision(next_state, goes_back=~(is_near | has_converged))
+    return _Decision(next_state, goes_back=~(keeps_iterate | has_converged))
 
 
 def best_relaxation(rate: Scalar) -> Scalar:

@@ -37,7 +37,7 @@ class CorrectionSize(NamedTuple):
     """The size of a correction.
 
     - `size`: the largest over all leaves, in units of their tolerances: 1 is just accepted.
-    - `bound`: the `size` of a correction as large as the whole state.
+    - `size_of_state`: the `size` that a correction as large as the whole state would have.
     - `is_rounding`: whether it is as small as rounding errors of the whole state, which can
         keep the corrections of a comparatively small leaf above its own tolerance forever.
     - `is_small`: whether it is below a hundredth of the whole state, so that the iterate is
@@ -45,7 +45,7 @@ class CorrectionSize(NamedTuple):
     """
 
     size: Scalar
-    bound: Scalar
+    size_of_state: Scalar
     is_rounding: _Flag
     is_small: _Flag
 
@@ -68,19 +68,21 @@ class Tolerance(NamedTuple):
         norm = max_norm if self.norm is optx.max_norm else self.norm
         return [norm(leaf) for leaf in jtu.tree_leaves(y)]
 
-    def measure(self, change: PyTree[Array], scale: PyTree[Array]) -> CorrectionSize:
+    def measure(
+        self, correction: PyTree[Array], scale: PyTree[Array]
+    ) -> CorrectionSize:
         """The size of a correction to a state of size `scale`, in the same structure."""
-        sizes = self.sizes(change)
+        sizes = self.sizes(correction)
         scales = self.sizes(scale)
         whole_state = largest(scales)
         size = self._in_units(sizes, scales)
-        bound = self._in_units([whole_state], [whole_state])
+        size_of_state = self._in_units([whole_state], [whole_state])
         eps = float(jnp.finfo(size.dtype).eps)
-        # An infinite correction to an infinite state is neither rounding nor small, since
-        # it is not strictly below.
+        # Comparisons are strict: an infinite correction to an infinite state, whose limits
+        # are infinite, too, is neither rounding nor small.
         is_rounding = largest(sizes) < ROUNDINGS * eps * whole_state
         is_small = largest(sizes) < _SMALL * whole_state
-        return CorrectionSize(size, bound, is_rounding, is_small)
+        return CorrectionSize(size, size_of_state, is_rounding, is_small)
 
     def _in_units(self, sizes: list[Scalar], scales: list[Scalar]) -> Scalar:
         """The largest of these sizes, each in units of its tolerance."""
@@ -136,22 +138,23 @@ def log2(x: Scalar) -> Scalar:
     """The base-2 logarithm of a positive number to within 0.09, with the mantissa as a
     linear interpolation. With the library function steps took 1.05 to 1.4 times as long.
     Zero is below all other numbers, and NaN above."""
-    # The bits of a positive float, read as an integer, are its biased exponent, followed by
-    # its mantissa: as a number in units of the exponent, a linear interpolation of the
-    # logarithm. `minexp - 1` removes the bias.
+    # The bits of 2^k (1 + m) with 0 <= m < 1, read as an integer, are the exponent `k +
+    # bias`, followed by the `nmant` bits of m. Over 2^nmant, they are `k + bias + m`. The
+    # logarithm is k + log2(1 + m), where m interpolates the second part linearly. The bias
+    # is `1 - minexp`.
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(jnp.abs(x), f"int{info.bits}").astype(x.dtype)
     return bits * 2.0**-info.nmant + float(info.minexp - 1)
 
 
 def converged(
-    level: Scalar, rate: Scalar, is_rounding: _Flag, has_stalled: _Flag
+    log2_size: Scalar, log2_rate: Scalar, is_rounding: _Flag, has_stalled: _Flag
 ) -> _Flag:
     """Whether the next correction will be below the tolerance by `LOG2_MARGIN`; or
     corrections no longer shrink (`has_stalled`) and are as small as rounding errors
-    (`is_rounding`). `level` and `rate` are the base-2 logarithms of the last correction, in
-    units of the tolerance, and of its ratio to the previous one."""
+    (`is_rounding`). `log2_size` and `log2_rate` are the base-2 logarithms of the last
+    correction, in units of the tolerance, and of its ratio to the previous one."""
     # With linear convergence the next correction is smaller by the same ratio. A correction
     # that grew says nothing about the next one, so that it must be small itself.
-    next_level = level + jnp.minimum(rate, 0)
-    return (next_level <= -LOG2_MARGIN) | (has_stalled & is_rounding)
+    next_log2_size = log2_size + jnp.minimum(log2_rate, 0)
+    return (next_log2_size <= -LOG2_MARGIN) | (has_stalled & is_rounding)

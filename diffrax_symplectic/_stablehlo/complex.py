@@ -39,7 +39,8 @@ def _absolute(a):
     dr = drjit()
     if is_zero(a.imag):
         return dr.abs(a.real)
-    # Not scaled: the square of an amplitude beyond 1e154 overflows.
+    # Unlike in a division, nothing is scaled here: in double precision the squares of
+    # numbers beyond 1e154 overflow.
     return dr.sqrt(dr.fma(a.real, a.real, a.imag * a.imag))
 
 
@@ -54,14 +55,15 @@ def _sign(a):
 def _square_root(a):
     """The root with a real part that is not negative, without cancellation."""
     dr = drjit()
-    # The larger part of the root is a root of a sum. The other part follows from their
-    # product, which is half of the imaginary part of `a`.
+    # The square of `x + i y` is `x^2 - y^2 + 2 i x y`, of absolute value `x^2 + y^2`. So
+    # the larger of `x^2` and `y^2` is `(|a| + |Re a|) / 2`, a sum without cancellation, and
+    # the other part of the root follows from `2 x y = Im a`.
     larger = dr.sqrt((_absolute(a) + dr.abs(a.real)) / 2)
     smaller = dr.select(larger == 0, 0, a.imag / (2 * larger))
-    # To the right of the imaginary axis the real part is the larger one.
-    is_right = a.real >= 0
-    real = dr.select(is_right, larger, dr.abs(smaller))
-    imag = dr.select(is_right, smaller, dr.copysign(larger, a.imag))
+    # If `Re a`, which is `x^2 - y^2`, is not negative, the real part is the larger one.
+    is_real_larger = a.real >= 0
+    real = dr.select(is_real_larger, larger, dr.abs(smaller))
+    imag = dr.select(is_real_larger, smaller, dr.copysign(larger, a.imag))
     return type(a)(real, imag)
 
 

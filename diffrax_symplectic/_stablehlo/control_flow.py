@@ -52,14 +52,15 @@ def _case(operation: Operation, index: Tensor) -> list[Tensor]:
     if value is not None:
         # An index that is out of range stands for the last branch.
         return operation.run(int(value) if 0 <= value <= last else last, [])
-    # A kernel cannot raise an error. Lanes that would are marked, and take another branch.
-    branches = []
+    # A kernel cannot raise an error. Lanes whose branch would raise one are marked as
+    # failed, and take the last of the other branches.
+    replayed_branches = []
     for i, region in enumerate(regions):
         if _raises(region):
             operation.fail(index.item() == i)
         else:
-            branches.append(i)
-    results = _results_of_branch(operation, index.item(), branches)
+            replayed_branches.append(i)
+    results = _results_of_branch(operation, index.item(), replayed_branches)
     return tensors_from(results, operation.shapes)
 
 
@@ -140,14 +141,14 @@ _MOST_UNROLLED_OF_INDICES = 32
 
 @rule
 def _while(operation: Operation, *xs: Tensor) -> list[Tensor]:
-    changes = _which_change(operation)
-    changing_entries = entries_of(elements_where(xs, changes))
+    is_changing = _which_change(operation)
+    changing_entries = entries_of(elements_where(xs, is_changing))
     has_only_indices = not any(map(drjit().is_float_v, changing_entries))
-    most = _MOST_UNROLLED_OF_INDICES if has_only_indices else _MOST_UNROLLED
+    max_unrolled = _MOST_UNROLLED_OF_INDICES if has_only_indices else _MOST_UNROLLED
     state = [*xs]
     # As long as the condition is known, the loop is unrolled. The iterations that are left
     # then, or after too many, are a loop of the kernel.
-    for _ in range(most):
+    for _ in range(max_unrolled):
         (condition,) = operation.run(_CONDITION, state)
         goes_on = known_values(condition)
         if goes_on is None:
@@ -155,7 +156,7 @@ def _while(operation: Operation, *xs: Tensor) -> list[Tensor]:
         if not goes_on:
             return state
         state = operation.run(_BODY, state)
-    return _loop(operation, state, changes)
+    return _loop(operation, state, is_changing)
 
 
 def _which_change(operation: Operation) -> list[bool]:
@@ -167,17 +168,17 @@ def _which_change(operation: Operation) -> list[bool]:
 
 
 def _loop(
-    operation: Operation, state: list[Tensor], changes: Sequence[bool]
+    operation: Operation, state: list[Tensor], is_changing: Sequence[bool]
 ) -> list[Tensor]:
-    """The state at the end of a loop of the kernel, which starts from `state`. `changes`
-    says which values of the state the loop's body changes."""
+    """The state at the end of a loop of the kernel, which starts from `state`.
+    `is_changing` says which values of the state the loop's body changes."""
     # Values that do not change stay out of the loop's state, so that constants stay known.
-    variables = elements_where(state, changes)
-    constants = elements_where(state, [not change for change in changes])
+    variables = elements_where(state, is_changing)
+    constants = elements_where(state, [not changes for changes in is_changing])
     shapes = [x.shape for x in variables]
 
     def whole_state(entries: Iterable[Any]) -> list[Tensor]:
-        return elements_of_both(changes, tensors_from(entries, shapes), constants)
+        return elements_of_both(is_changing, tensors_from(entries, shapes), constants)
 
     # The mask of the lanes that failed so far is part of the state of Dr.Jit's loop, which
     # returns nothing else.
@@ -192,7 +193,9 @@ def _loop(
         new_state, fails_now = operation.with_failures(
             lambda: operation.run(_BODY, whole_state(entries))
         )
-        return failed | fails_now, *copied_entries(elements_where(new_state, changes))
+        return failed | fails_now, *copied_entries(
+            elements_where(new_state, is_changing)
+        )
 
     # Where no lane can fail, Dr.Jit leaves the mask out.
     no_lane = array_types()["i1"](False)

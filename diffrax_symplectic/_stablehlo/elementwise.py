@@ -19,10 +19,10 @@ from .integers import arithmetic_shift, logical_shift, safe_divisor, shift_left
 # Powers with whole exponents up to this size are products, of at most twelve factors, which
 # have no logarithm of a negative number. Larger ones are computed by logarithms.
 _MOST_MULTIPLIED = 64
-# The series of the complementary error function maps this place to the middle of its range,
-# and zero and infinity to the ends. Its degree depends on the size of numbers in bytes. The
-# first coefficients left out are 2e-9 and 7e-17. With a middle of 4 they are as small, with
-# 2 larger.
+# The series of the complementary error function maps this number to the middle of its
+# range, and zero and infinity to the ends. Its degree depends on the size of numbers in
+# bytes. The first coefficients left out are 2e-9 and 7e-17. With a middle of 4 they are as
+# small, with 2 larger.
 _ERFC_MIDDLE = 3.0
 _ERFC_DEGREES = {4: 11, 8: 23}
 # The complementary error function is zero in both precisions from here on.
@@ -58,8 +58,8 @@ def _multiply(a, b):
 def _times_zero(a, zero):
     """The product of a number that is not known while the kernel is recorded and a zero
     that is."""
-    # The difference is zero, too, but Dr.Jit does not fold it, and it is NaN for an
-    # infinite number.
+    # `a - a` is zero, too, but NaN where `a` is infinite or NaN, and so is the product. And
+    # Dr.Jit does not fold it, so that it computes the product.
     unknown_zero = a - a
     return a * (-unknown_zero if np.signbit(zero[0]) else unknown_zero)
 
@@ -93,9 +93,10 @@ def _clamp(low, a, high):
 def _divide(a, b):
     if drjit().is_float_v(a):
         return a / b
-    safe, zero, _ = safe_divisor(a, b)
-    # Dr.Jit's `//` of integers rounds to zero, as StableHLO does.
-    return drjit().select(zero, ~type(a)(0), a // safe)
+    safe, is_zero_divisor, _ = safe_divisor(a, b)
+    # Dr.Jit's `//` of integers rounds to zero, as StableHLO does. By zero, the quotient has
+    # all bits set, as in XLA.
+    return drjit().select(is_zero_divisor, ~type(a)(0), a // safe)
 
 
 def _remainder(a, b):
@@ -103,23 +104,25 @@ def _remainder(a, b):
     if drjit().is_float_v(a):
         return _remainder_of_floats(a, b)
     dr = drjit()
-    safe, zero, minus_one = safe_divisor(a, b)
+    safe, is_zero_divisor, is_minus_one = safe_divisor(a, b)
     rest = a - (a // safe) * safe
-    return dr.select(zero, a, dr.select(minus_one, type(a)(0), rest))
+    return dr.select(is_zero_divisor, a, dr.select(is_minus_one, type(a)(0), rest))
 
 
 def _remainder_of_floats(a, b):
     dr = drjit()
     size = dr.abs(a)
     divisor = dr.abs(b)
-    rest = dr.fma(-dr.trunc(size / divisor), divisor, size)
-    # Where the quotient was rounded to the next whole number, the rest is off by one
-    # divisor.
-    is_negative = rest < 0
-    one_more = rest + divisor
-    at_most_one_less = dr.select(rest >= divisor, rest - divisor, rest)
-    rest = dr.select(is_negative, one_more, at_most_one_less)
-    rest = dr.select(dr.isinf(b) & dr.isfinite(a), size, rest)
+    nearly_rest = dr.fma(-dr.trunc(size / divisor), divisor, size)
+    # Where the quotient was rounded to the next whole number, this is off by one divisor.
+    is_negative = nearly_rest < 0
+    one_more = nearly_rest + divisor
+    at_most_one_less = dr.select(
+        nearly_rest >= divisor, nearly_rest - divisor, nearly_rest
+    )
+    finite_rest = dr.select(is_negative, one_more, at_most_one_less)
+    # A finite number is its own rest by an infinite divisor: the product above is NaN.
+    rest = dr.select(dr.isinf(b) & dr.isfinite(a), size, finite_rest)
     return dr.select(dr.isfinite(a) & ~(b == 0), dr.copysign(rest, a), type(a)(np.nan))
 
 
@@ -148,10 +151,10 @@ def _power(base, exponent):
     # As in JAX, minus infinity has powers for other exponents, too.
     other_power = dr.select(dr.isinf(base), power_of_size, dtype(np.nan))
     of_negative = dr.select(is_whole, whole_power, other_power)
-    power = dr.select(base < 0, of_negative, power_of_size)
-    # The product of logarithm and exponent is infinity times zero, or may be, for powers of
-    # zero, the power zero, and powers of one.
-    power = dr.select((base == 0) & (exponent > 0), dtype(0), power)
+    by_logarithm = dr.select(base < 0, of_negative, power_of_size)
+    # The product of logarithm and exponent may be infinity times zero, which is NaN: for a
+    # base of zero or one, and for an exponent of zero.
+    power = dr.select((base == 0) & (exponent > 0), dtype(0), by_logarithm)
     return dr.select((exponent == 0) | (base == 1), dtype(1), power)
 
 
@@ -211,14 +214,15 @@ def _atan2(y, x):
     longer = dr.select(steep, dr.abs(y), dr.abs(x))
     # The quotient of two infinities would be NaN: they count as equal.
     slope = dr.select(shorter == longer, dtype(1), shorter / longer)
-    angle = dr.asin(slope / dr.sqrt(1 + slope * slope))
-    # From one eighth of the circle to all of it.
-    angle = dr.select(steep, np.pi / 2 - angle, angle)
+    in_eighth = dr.asin(slope / dr.sqrt(1 + slope * slope))
+    # From one eighth of the circle to a quarter, a half, and all of it.
+    in_quarter = dr.select(steep, np.pi / 2 - in_eighth, in_eighth)
     # Two zeros counted as equal, too, but their angle is 0.
-    angle = dr.select(y == 0, dtype(0), angle)
+    in_quarter_or_zero = dr.select(y == 0, dtype(0), in_quarter)
     # The sign of `x` counts, also where it is zero: the angle of (0, -0) is pi.
-    angle = dr.select(dr.copysign(dtype(1), x) < 0, np.pi - angle, angle)
-    return dr.select(_is_nan(y) | _is_nan(x), y + x, dr.copysign(angle, y))
+    is_left = dr.copysign(dtype(1), x) < 0
+    in_half = dr.select(is_left, np.pi - in_quarter_or_zero, in_quarter_or_zero)
+    return dr.select(_is_nan(y) | _is_nan(x), y + x, dr.copysign(in_half, y))
 
 
 def _erf(a):

@@ -1,54 +1,67 @@
 """Integers, where Dr.Jit differs from StableHLO."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .backend import array_types, drjit
 
 
+class SafeDivisor(NamedTuple):
+    """A divisor in place of an integer, by which another can be divided.
+
+    - `divisor`: the integer itself, or 1 where a processor would trap.
+    - `is_zero`, `is_minus_one`: the masks where the integer is 0 or -1.
+    """
+
+    divisor: Any
+    is_zero: Any
+    is_minus_one: Any
+
+
 def safe_divisor(a, b):
-    """A divisor in place of the integer `b`, by which `a` can be divided; the mask where
-    `b` is 0; and the mask where it is -1. Processors trap on division by zero, and of the
-    smallest integer by -1: there the divisor is 1."""
+    """The divisor of `a` in place of `b`. Processors trap on division by zero, and of the
+    smallest integer by -1, whose quotient is beyond the largest."""
     dr = drjit()
     is_zero = b == 0
     # A number without sign is never -1: the mask is false everywhere.
     is_minus_one = (b == -1) if dr.is_signed_v(b) else ~is_zero & is_zero
-    overflows = is_minus_one & (a == _least(a))
+    overflows = is_minus_one & (a == _smallest_of_type(a))
     safe = dr.select(is_zero | overflows, type(b)(1), b)
-    return safe, is_zero, is_minus_one
+    return SafeDivisor(safe, is_zero, is_minus_one)
 
 
-def _least(a):
-    """The smallest integer of its type."""
+def _smallest_of_type(a):
+    """The smallest integer of the type of `a`."""
     bits = 8 * drjit().itemsize_v(a)
     return type(a)(-(2 ** (bits - 1)) if drjit().is_signed_v(a) else 0)
 
 
 # In Dr.Jit the type of a number decides whether a shift is logical or arithmetic, in
-# StableHLO the operation. A negative number of bits counts as a large one, as which its
-# bits read without sign.
+# StableHLO the operation. Numbers of bits are read without sign, so that a negative one is
+# larger than the number of all bits.
 
 
-def shift_left(a, b):
-    b = _without_sign(b)
+def shift_left(a, num_bits):
+    num_bits = _without_sign(num_bits)
     # A shift by all bits or more gives zero. LLVM leaves it undefined.
-    return drjit().select(b < 8 * drjit().itemsize_v(a), a << type(a)(b), 0)
+    is_by_fewer = num_bits < 8 * drjit().itemsize_v(a)
+    return drjit().select(is_by_fewer, a << type(a)(num_bits), 0)
 
 
-def logical_shift(a, b):
-    b = _without_sign(b)
-    shifted = type(a)(_without_sign(a) >> b)
-    return drjit().select(b < 8 * drjit().itemsize_v(a), shifted, 0)
+def logical_shift(a, num_bits):
+    num_bits = _without_sign(num_bits)
+    shifted = type(a)(_without_sign(a) >> num_bits)
+    return drjit().select(num_bits < 8 * drjit().itemsize_v(a), shifted, 0)
 
 
-def arithmetic_shift(a, b):
-    b = _without_sign(b)
+def arithmetic_shift(a, num_bits):
+    num_bits = _without_sign(num_bits)
     signed = _with_same_bits("i", a)
-    # A shift by all bits or more leaves the sign.
-    most = type(b)(8 * drjit().itemsize_v(a) - 1)
-    return type(a)(signed >> type(signed)(drjit().select(b < most, b, most)))
+    # A shift by all bits or more leaves the sign in all bits, as one by all but one does.
+    all_but_one = type(num_bits)(8 * drjit().itemsize_v(a) - 1)
+    bounded = drjit().select(num_bits < all_but_one, num_bits, all_but_one)
+    return type(a)(signed >> type(signed)(bounded))
 
 
 def _without_sign(a):
@@ -56,7 +69,8 @@ def _without_sign(a):
 
 
 def _with_same_bits(prefix: str, a: Any) -> Any:
-    """The integer of the same bits, of a signed type (`i`) or one without sign (`ui`)."""
+    """The integer with the same bits as `a`, of a signed type (`i`) or one without sign
+    (`ui`)."""
     return array_types()[f"{prefix}{8 * drjit().itemsize_v(a)}"](a)
 
 

@@ -52,7 +52,8 @@ def _number_of_pivot_row(rows: Matrix, column: int) -> Any:
 
 def _exchange_with_pivot_row(rows: Matrix, top: int, pivot: Any) -> None:
     """Exchanges the row number `top` with row `pivot`, which is the same or one below."""
-    # Rows have no address within a kernel: any row below may be the one to exchange.
+    # The number of the pivot differs between paths, and rows in registers cannot be read by
+    # a number. So each row below is exchanged in those lanes where it is the pivot.
     old_top = rows[top]
     new_top = old_top
     for below in range(top + 1, len(rows)):
@@ -170,7 +171,8 @@ def _getrf(operation: Operation, x: Tensor) -> list[Tensor]:
         factors.append(factors_of_matrix)
         pivots.extend(pivots_of_matrix)
     _, shape_of_pivots, shape_of_info = operation.shapes
-    # JAX asks `info` for arguments that LAPACK does not take, not for pivots of zero.
+    # LAPACK reports arguments that it does not take by a negative `info`, and pivots of
+    # zero by a positive one. JAX looks for the first only, which do not occur here.
     success = array_types()["i32"](0)
     return [
         _tensor_of(factors, x.shape),
@@ -188,7 +190,7 @@ def _potrf(operation: Operation, x: Tensor) -> list[Tensor]:
         # The upper factor U of `A = U^T U` is the transpose of the lower one.
         factor, failed = _cholesky(_transposed(matrix) if is_upper else matrix)
         factors.append(_transposed(factor) if is_upper else factor)
-        # JAX asks whether `info` is zero.
+        # JAX only compares `info` with zero, so that any other number stands for failure.
         info.append(drjit().select(failed, array_types()["i32"](1), 0))
     _, shape_of_info = operation.shapes
     return [_tensor_of(factors, x.shape), Tensor(info, shape_of_info)]
@@ -205,10 +207,13 @@ def _trsm(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
     solutions = []
     pairs = zip(_matrices(operation, a), _matrices(operation, b), strict=True)
     for matrix, rhs in pairs:
-        rhs = _transposed(rhs) if is_on_the_right else rhs
-        matrix = _transposed(matrix) if is_transposed else matrix
-        # The transpose of a lower triangle is an upper one.
-        x = _solve_triangular(matrix, rhs, is_lower != is_transposed, is_unit)
+        x = _solve_triangular(
+            _transposed(matrix) if is_transposed else matrix,
+            _transposed(rhs) if is_on_the_right else rhs,
+            # The transpose of a lower triangle is an upper one.
+            is_lower=is_lower != is_transposed,
+            is_unit=is_unit,
+        )
         solutions.append(_transposed(x) if is_on_the_right else x)
     return [_tensor_of(solutions, b.shape)]
 
@@ -223,7 +228,7 @@ _LAPACK: dict[str, Callable[..., list[Tensor]]] = {
 @rule
 def _custom_call(operation: Operation, *xs: Tensor) -> list[Tensor]:
     target = call_target(operation.mlir_op)
-    # Older versions of JAX say so on which devices an array is.
+    # By this call, older versions of JAX say on which devices an array is.
     if target == "Sharding":
         return list(xs)
     # The first letter of LAPACK's name says the precision, single or double.

@@ -101,8 +101,7 @@ def constant_values(op: Any) -> np.ndarray:
     shape = tuple(result_type.shape)
     if str(result_type.element_type).startswith("complex"):
         return _complex_constant(str(op), shape)
-    # Of a constant of equal entries MLIR stores one entry, and does not promise to hand out
-    # all of them.
+    # If all entries are equal, MLIR stores one, and may hand out this one alone.
     return np.broadcast_to(np.asarray(op.attributes["value"]), shape)
 
 

@@ -27,7 +27,7 @@ def _iota(operation: Operation) -> list[Tensor]:
 
 @rule
 def _broadcast_in_dim(operation: Operation, x: Tensor) -> list[Tensor]:
-    # The axes of `x` in the order of those of the result, and new ones of length one.
+    # The shape of `x` with an axis for each of the result: new axes have length one.
     sizes = [1] * len(operation.shape)
     for axis, size in zip(operation.integers("broadcast_dimensions"), x.shape):
         sizes[axis] = size
@@ -70,22 +70,22 @@ def _concatenate(operation: Operation, *xs: Tensor) -> list[Tensor]:
 def _pad(operation: Operation, x: Tensor, value: Tensor) -> list[Tensor]:
     before = operation.integers("edge_padding_low")
     between = operation.integers("interior_padding")
-    # For each axis, the index in the result of each index of `x`. A negative padding moves
+    # For each axis, where in the result each index of `x` goes. A negative padding moves
     # some out of the result.
-    targets = [
+    indices_in_result = [
         begin + np.arange(length) * (gap + 1)
         for begin, gap, length in zip(before, between, x.shape)
     ]
     is_inside = [
-        (0 <= target) & (target < length)
-        for target, length in zip(targets, operation.shape)
+        (0 <= indices) & (indices < length)
+        for indices, length in zip(indices_in_result, operation.shape)
     ]
-    targets_inside = [target[inside] for target, inside in zip(targets, is_inside)]
+    targets = [indices[inside] for indices, inside in zip(indices_in_result, is_inside)]
     # One list of the entries of `x` and the value, which comes last.
     all_entries = Tensor([*x.entries, value.item()], ())
     place_of_value = len(x.entries)
     places = np.full(operation.shape, place_of_value)
-    places[np.ix_(*targets_inside)] = x.places[np.ix_(*is_inside)]
+    places[np.ix_(*targets)] = x.places[np.ix_(*is_inside)]
     return [all_entries.take(places)]
 
 
@@ -154,8 +154,9 @@ def _in_total_order(a: Any) -> Any:
     """
     num_bits = 8 * drjit().itemsize_v(a)
     bits = drjit().reinterpret_array(array_types()[f"i{num_bits}"], a)
-    # The shift fills all bits with the sign, so that all other bits of negative numbers are
-    # turned.
-    sign = bits >> (num_bits - 1)
+    # The shift copies the bit of the sign to all bits: of a negative number all are set, of
+    # others none. So the last line flips all bits of negative numbers but the sign, which
+    # reverses their order.
+    filled_with_sign = bits >> (num_bits - 1)
     all_but_sign = 2 ** (num_bits - 1) - 1
-    return bits ^ (sign & all_but_sign)
+    return bits ^ (filled_with_sign & all_but_sign)

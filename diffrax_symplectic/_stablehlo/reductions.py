@@ -62,8 +62,9 @@ def _sum_left_out(factors: Sequence[Any], others: Sequence[Any]) -> Any:
     unknown = [x for x in others if not is_literal(x)]
     if not unknown or not any(map(is_zero, factors)):
         return 0
-    # The sum is over all unknown factors, not those beside zeros alone: so it is the same
-    # for all rows of a sparse matrix, which stay cheap.
+    # A difference of equal numbers is zero, or NaN if they are infinite or NaN. The sum is
+    # over all unknown factors, not those beside zeros alone: so it is the same for all rows
+    # of a sparse matrix, and Dr.Jit computes it once.
     total = ft.reduce(operator.add, unknown)
     return total - total
 
@@ -90,12 +91,13 @@ def _reduce(operation: Operation, *xs: Tensor) -> list[Tensor]:
     # (entries of a result, entries that are reduced to one)
     num_results = math.prod(shape_of_results)
     places = arrays[0].places.transpose(*kept, *axes).reshape(num_results, -1)
-    is_neutral = _changes_nothing(operation, initial)
+    starts_neutral = _starts_neutral(operation, initial)
     totals = []
     for places_of_total in places:
         parts = [_entries_at(arrays, place) for place in places_of_total]
-        # Most reductions start from a neutral element, such as zero in a sum.
-        total = parts.pop(0) if parts and is_neutral else [*initial]
+        # A neutral element, such as zero in a sum, is left out: the first part takes its
+        # place.
+        total = parts.pop(0) if parts and starts_neutral else [*initial]
         for part in parts:
             total = operation.run(ONLY_REGION, [*total, *part])
         totals.append(total)
@@ -139,7 +141,7 @@ _NEUTRAL = {
 }
 
 
-def _changes_nothing(operation: Operation, initial: Sequence[Tensor]) -> bool:
+def _starts_neutral(operation: Operation, initial: Sequence[Tensor]) -> bool:
     """Whether a reduction starts from the neutral element of its operation."""
     if len(initial) > 1:
         return False
@@ -216,14 +218,14 @@ def _put_in_order(
     operation: Operation, arrays: list[list[Any]], left: int, right: int
 ) -> None:
     """Exchanges the entries at two places, in all arrays, where the order is wrong."""
-    # The region says whether the first of two must stand before the second, and takes both
-    # of each array in turn. The right one is asked about first: they are exchanged only if
-    # the right one must stand first, so equals stay.
+    # The region takes two entries of each array in turn, and says whether the first of two
+    # must stand before the second. It gets the right one as the first: for equals it says
+    # no, so that they stay.
     pairs = [scalar(entries[place]) for entries in arrays for place in (right, left)]
-    (answer,) = operation.run(ONLY_REGION, pairs)
-    is_wrong = answer.item()
+    (right_comes_first,) = operation.run(ONLY_REGION, pairs)
+    is_wrong_order = right_comes_first.item()
     select = drjit().select
     for entries in arrays:
-        new_left = select(is_wrong, entries[right], entries[left])
-        entries[right] = select(is_wrong, entries[left], entries[right])
+        new_left = select(is_wrong_order, entries[right], entries[left])
+        entries[right] = select(is_wrong_order, entries[left], entries[right])
         entries[left] = new_left

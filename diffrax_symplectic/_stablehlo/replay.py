@@ -82,6 +82,7 @@ class Replay:
         written into the kernel.
         """
         failures: list[Any] = []
+        # `_results` looks here whether a constant is in memory; empty without `constants`.
         self._memory = dict(zip(self._constants, constants))
         return self._call("main", args, failures), failures
 

@@ -126,9 +126,10 @@ def _both_masks(one: Any, other: Any) -> Any:
 
 
 def _selected(mask: Any, new: Tensor, old: Tensor | None) -> Tensor:
-    """The new entries in the lanes of a mask, and the old ones elsewhere."""
-    # Without old entries, `new` are those of the first possible window. The window of each
-    # lane is one of the possible ones, so a later one replaces these where they are wrong.
+    """The new entries in the lanes of a mask, and the old ones elsewhere; without old
+    entries, the new ones in all lanes."""
+    # Callers go through all possible windows, of which each lane has one, and pass no old
+    # entries with the first. In other lanes a later window replaces it.
     if old is None or mask is True:
         return new
     return map_entries(ft.partial(drjit().select, mask), new, old)
@@ -229,12 +230,11 @@ def _dynamic_slice(operation: Operation, x: Tensor, *starts: Tensor) -> list[Ten
 def _dynamic_update_slice(
     operation: Operation, x: Tensor, update: Tensor, *starts: Tensor
 ) -> list[Tensor]:
-    # One list: the entries of `x`, followed by those of the update.
+    # One list: the entries of `x`, followed by those of the update. Each possible result is
+    # a selection of its places.
     both = Tensor([*entries_of([x, update])], ())
     wide_starts = [*map(_widened, starts)]
     result = None
-    # The first possible window is taken for all lanes, and replaced by each of the others
-    # in its lanes.
     for slices, mask in _possible_windows(operation, x, wide_starts, update.shape):
         places = x.places.copy()
         places[slices] = len(x.entries) + update.places

@@ -134,14 +134,14 @@ def drift_order(tableau: FlatTableau) -> int:
         [(c**2, 1 / 3), (M @ c, 1 / 6)],
         [(c**3, 1 / 4), (c * (M @ c), 1 / 8), (M @ c**2, 1 / 12), (M @ M @ c, 1 / 24)],
     )
-    # The place of a list of trees is the order that remains if its condition fails.
-    for order, trees in enumerate(conditions):
-        for (tree, exact), part in itertools.product(trees, set(writes)):
+    # Conditions number k are for order k + 1. If one of them fails, the order is k.
+    for order_so_far, trees in enumerate(conditions):
+        for (vector, exact), part in itertools.product(trees, set(writes)):
             # Momenta and positions have weights of their own, and each part its condition.
             in_part = writes == part
-            value = flat.weights[in_part] @ tree[in_part]
+            value = flat.weights[in_part] @ vector[in_part]
             if abs(value - exact) > _ROUNDING:
-                return order
+                return order_so_far
     return len(conditions)
 
 
@@ -166,7 +166,9 @@ def _(tableau: GeneralTableau) -> dict:
 def _(tableau: SeparableTableau) -> dict:
     # The other random variables of the paper are functions of `W`, as in
     # `_weak_conditions`, so that there is one more condition for each.
-    others = _conditions_on_others(tableau.beta, {"A1e": tableau.A1.sum(axis=1)})
+    others = _conditions_on_other_variables(
+        tableau.beta, {"A1e": tableau.A1.sum(axis=1)}
+    )
     return _strong_conditions(tableau.partitioned()) | others
 
 
@@ -176,7 +178,7 @@ def _(tableau: PartitionedTableau) -> dict:
         "alpha.e - 1": tableau.alpha.sum() - 1,
         "alpha_hat.e - 1": tableau.alpha_hat.sum() - 1,
         "beta.e - 1": tableau.beta["W"].sum() - 1,
-        **_conditions_on_others(tableau.beta, {"e": np.ones(len(tableau.A1))}),
+        **_conditions_on_other_variables(tableau.beta, {"e": np.ones(len(tableau.A1))}),
     }
 
 
@@ -269,7 +271,7 @@ def _(tableau: PartitionedTableau) -> _WeakConditions:
         "alpha.e - 1": tableau.alpha.sum() - 1,
         "alpha_hat.e - 1": tableau.alpha_hat.sum() - 1,
         "(beta.e)^2 - 1": be.sum() ** 2 - 1,
-        **_conditions_on_others(tableau.beta, {"e": np.ones(len(A1))}),
+        **_conditions_on_other_variables(tableau.beta, {"e": np.ones(len(A1))}),
     }
     # As they are independent, the mean of a product of two vanishes unless they are the
     # same: only squares are left, with the variance as their mean.
@@ -306,7 +308,7 @@ def _(tableau: SeparableTableau) -> _WeakConditions:
     weak = _weak_conditions(dataclasses.replace(tableau.partitioned(), B0=only_W))
     B0e = tableau.B0["W"].sum(axis=1)
     moments = {"A1e": tableau.A1.sum(axis=1), "A1(B0e)": tableau.A1 @ B0e}
-    others = _conditions_on_others(tableau.beta, moments)
+    others = _conditions_on_other_variables(tableau.beta, moments)
     third_moment = {"beta.A1((B0e)^2)": tableau.beta["W"] @ tableau.A1 @ B0e**2}
     return _WeakConditions(weak.first, weak.second | third_moment | others)
 
@@ -351,7 +353,7 @@ def _check_only_increment_drives_noise(tableau: GeneralTableau) -> None:
         )
 
 
-def _conditions_on_others(
+def _conditions_on_other_variables(
     beta: Mapping[str, np.ndarray], moments: Mapping[str, np.ndarray]
 ) -> dict:
     """The residuals of the conditions that the products of the weights `beta` of random

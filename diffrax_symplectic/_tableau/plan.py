@@ -86,10 +86,11 @@ def _make_plan(stages: tuple[Stage, ...], matrix: bytes, weights: bytes) -> Step
     matrix_of_reads = np.where(tableau.reads_from, tableau.matrix, 0.0)
     tableau = dataclasses.replace(tableau, matrix=_snapped(matrix_of_reads))
     # Each of the three reductions can make more work for the others: stages may become
-    # equal once others were dropped, and weights may cancel once stages were merged.
-    previous = None
-    while previous is None or len(tableau.stages) < len(previous.stages):
-        previous = tableau
+    # equal once others were dropped, and weights may cancel once stages were merged. So
+    # they are repeated until no stage is lost.
+    num_before = None
+    while num_before is None or len(tableau.stages) < num_before:
+        num_before = len(tableau.stages)
         tableau = _with_equal_stages_merged(tableau)
         tableau = _with_live_stages(tableau)
         # This comes last, since a stage whose weight cancels would keep others from being

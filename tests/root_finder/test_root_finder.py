@@ -11,7 +11,7 @@ import optimistix as optx
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._batch import most_of_batch
+from diffrax_symplectic._batch import largest_in_batch
 from diffrax_symplectic._fused.sweeps import solve_one_path
 from diffrax_symplectic._root_finder.tolerance import converged, max_norm
 
@@ -332,7 +332,7 @@ def test_a_loop_of_a_batch_has_one_length_for_all():
     # Were it one for each path, whatever they share would be computed for each of them.
     shared = lambda fn: jax.vmap(fn, out_axes=None)
     counts = jnp.array([[0, 2, 1], [1, 5, 0]])
-    assert shared(shared(most_of_batch))(counts) == 5
+    assert shared(shared(largest_in_batch))(counts) == 5
 
 
 @pytest.mark.core
