@@ -4,7 +4,7 @@ import dataclasses
 import functools as ft
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import diffrax
 import numpy as np
@@ -28,7 +28,7 @@ from .._terms import (
     with_paths,
 )
 from .call import checked_call
-from .choose import choose, Request, trial_key, trial_sampling
+from .choose import choose, Decision, Request, trial_key, trial_sampling
 from .estimate import (
     cautions,
     Expectation,
@@ -213,9 +213,8 @@ def expectation(
     with ShortTraceback(), Kept() as kept, progress:
         while True:
             progress.stage("preparing the samples")
-            problem, used_sampling, plan = choose(
-                ft.partial(problem_of, levels), request
-            )
+            decision = choose(ft.partial(problem_of, levels), request)
+            problem, used_sampling, plan = decision
             progress.stage(f"compiling and sampling with {levels} step sizes")
             estimate = run(
                 plan, key, devices, used_sampling, start, first, tol, progress, times,
@@ -228,47 +227,91 @@ def expectation(
             levels += 1
 
         progress.stage("checking the steps")
-        advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
-        # `num_paths` are those that did not fail.
-        most_fail = estimate.num_failed > estimate.num_paths
-        lost_numbers = out_of_range(problem, most_fail)
-        if lost_numbers is not None and most_fail:
-            advice = lost_numbers
-        elif lost_numbers is not None:
-            warnings.warn(lost_numbers, stacklevel=2)
-        elif most_fail and may_be_too_long(problem.with_any_steps()):
-            angle = unresolved_angle(problem.with_any_steps())
-            shorter = float(dt0) / max(4, angle or 0)
-            advice = (
-                f"Most likely, steps of `dt0={float(dt0):g}` are too long for "
-                f"`{type(solver).__name__}`: pass `dt0={shorter:.2g}` or less, or an "
-                f"implicit solver. {advice}"
-            )
-        for message in cautions(estimate, tol, advice):
+        for message in _messages_on_result(estimate, problem, tol, float(dt0)):
             warnings.warn(message, stacklevel=2)
         paths = plan.simulate_paths
         if isinstance(paths, FusedPaths):
             warn_of_stragglers(
                 paths.num_stragglers, paths.num_failed, paths.num_paths, stacklevel=2
             )
-        _warn_of_rounding(estimate, problem)
         # Warnings of the problem come with its first samples, and not again with later
         # parts.
         if start is None and first == 0:
-            messages = messages_on_steps(problem.with_any_steps(), float(dt0))
-            # A trial takes longer than these looks, which name the cause.
-            if estimate.levels == 2 and not messages:
-                trial = trial_with_finer_level(estimate, problem, plan, key, devices)
-                estimate = dataclasses.replace(estimate, caveat=trial.caveat)
-                messages += [] if trial.message is None else [trial.message]
-            if has_kinks(problem):
-                messages += _messages_on_discrete_increments(
-                    estimate, problem, key, devices
-                )
-            for message in messages:
+            checked = _checked(estimate, decision, key, devices, float(dt0))
+            for message in checked.messages:
                 warnings.warn(message, stacklevel=2)
             warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
+            estimate = dataclasses.replace(estimate, caveat=checked.caveat)
     return estimate
+
+
+def _messages_on_result(
+    estimate: Expectation, problem: Problem, tol: float | None, dt0: float
+) -> list[str]:
+    """What is wrong with the numbers of an estimate, as sentences: failed paths, numbers
+    out of range, an error bar that may be too small, and rounding."""
+    # `num_paths` are those that did not fail.
+    most_fail = estimate.num_failed > estimate.num_paths
+    lost_numbers = out_of_range(problem, most_fail)
+    if lost_numbers is not None and most_fail:
+        return [*cautions(estimate, tol, advice=lost_numbers)]
+    advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
+    if most_fail:
+        advice = _advice_on_long_steps(problem, dt0) + advice
+    messages = [
+        *cautions(estimate, tol, advice),
+        lost_numbers,
+        _message_on_rounding(estimate, problem),
+    ]
+    return [message for message in messages if message is not None]
+
+
+def _advice_on_long_steps(problem: Problem, dt0: float) -> str:
+    """Which steps to take where most paths fail because they are too long; empty if they
+    are not."""
+    any_steps = problem.with_any_steps()
+    if not may_be_too_long(any_steps):
+        return ""
+    shorter = dt0 / max(4, unresolved_angle(any_steps) or 0)
+    return (
+        f"Most likely, steps of `dt0={dt0:g}` are too long for "
+        f"`{type(problem.solver).__name__}`: pass `dt0={shorter:.2g}` or less, or an "
+        "implicit solver. "
+    )
+
+
+class _Checked(NamedTuple):
+    """What checks of a problem found.
+
+    - `messages`: what is wrong, as sentences.
+    - `caveat`: that of an `Expectation`.
+    """
+
+    messages: list[str]
+    caveat: str
+
+
+def _checked(
+    estimate: Expectation,
+    decision: Decision,
+    key: PRNGKeyArray,
+    devices: Devices,
+    dt0: float,
+) -> _Checked:
+    """What is wrong with the steps, and with discrete increments, by looks at the problem
+    and by trials."""
+    problem, _, plan = decision
+    messages = messages_on_steps(problem.with_any_steps(), dt0)
+    caveat = ""
+    # A trial takes longer than these looks, which name the cause.
+    if estimate.levels == 2 and not messages:
+        trial = trial_with_finer_level(estimate, problem, plan, key, devices)
+        caveat = trial.caveat
+        if trial.message is not None:
+            messages.append(trial.message)
+    if has_kinks(problem):
+        messages += _messages_on_discrete_increments(estimate, problem, key, devices)
+    return _Checked(messages, caveat)
 
 
 def messages_on_steps(problem: Problem, dt0: float) -> list[str]:
@@ -340,21 +383,22 @@ def _trial_with_gaussian_increments(
     return run(plan, key_of_trial, devices)
 
 
-def _warn_of_rounding(estimate: Expectation, problem: Problem) -> None:
-    """Warns if rounding in single precision may exceed the sampling error."""
+def _message_on_rounding(estimate: Expectation, problem: Problem) -> str | None:
+    """What to do if rounding in single precision may exceed the sampling error, as
+    sentences; `None` if it does not."""
     precision = np.finfo(problem.dtype)
     if precision.bits >= 64:
-        return
+        return None
     # The rounding errors of a step size have the same sign in all steps, so they add up.
     fraction = float(precision.eps) * problem.finest_steps
     # No estimate reports a standard error below this (see `rounding_floor`). Up to twice
     # the floor, rounding may be most of it.
     floor = fraction * np.abs(estimate.vectors.mean)
-    if np.any(estimate.vectors.std_error <= 2 * floor):
-        warnings.warn(
-            "Rounding errors may be larger than the sampling error: over "
-            f"{problem.finest_steps:,} steps in {precision.dtype} they are about "
-            f"{fraction:.0e} of the mean, which is the smallest `std_error` reported. For "
-            'more digits call `jax.config.update("jax_enable_x64", True)` first.',
-            stacklevel=3,
-        )
+    if not np.any(estimate.vectors.std_error <= 2 * floor):
+        return None
+    return (
+        "Rounding errors may be larger than the sampling error: over "
+        f"{problem.finest_steps:,} steps in {precision.dtype} they are about "
+        f"{fraction:.0e} of the mean, which is the smallest `std_error` reported. For more "
+        'digits call `jax.config.update("jax_enable_x64", True)` first.'
+    )
