@@ -87,12 +87,15 @@ def traced(fn: Callable, *inputs: PyTree, identity: Any = None) -> Traced:
     """The function as a program of inputs like these: arrays or their shapes, and what else
     it takes, which is then part of the program. A `Traced` is returned as it is.
 
-    What a trace only names, such as the rule of a custom derivative, is taken for the same
-    where `identity` is: the user's function, if `fn` calls it."""
+    `identity` stands for code that a trace names, but does not contain, such as a callback
+    or the rule of a custom derivative: programs with such code are the same only for the
+    same `identity`. It is the user's function where `fn` is made anew around it in each
+    call, and by default `fn`."""
     if isinstance(fn, Traced):
         return fn
     leaves, treedef = jtu.tree_flatten((fn, inputs))
     is_array = [_is_array_or_struct(leaf) for leaf in leaves]
+    # Set by `results` while it is traced.
     static_results = None
 
     # JAX keeps traces by the identity of functions. This function is new in each call of
@@ -103,23 +106,25 @@ def traced(fn: Callable, *inputs: PyTree, identity: Any = None) -> Traced:
         all_leaves = [
             next(remaining) if is_it else leaf for is_it, leaf in zip(is_array, leaves)
         ]
-        fn_with_arrays, inputs = treedef.unflatten(all_leaves)
-        result = fn_with_arrays(*inputs)
+        fn_with_arrays, traced_inputs = treedef.unflatten(all_leaves)
+        result = fn_with_arrays(*traced_inputs)
         dynamic, static_results = eqx.partition(result, eqx.is_array_like)
         return dynamic
 
     arrays = [leaf for is_it, leaf in zip(is_array, leaves) if is_it]
-    closed, struct = jax.make_jaxpr(results, return_shape=True)(*arrays)
-    jaxpr, text_numbers = _numbers_apart(closed.jaxpr)
+    make_jaxpr = jax.make_jaxpr(results, return_shape=True)
+    closed_jaxpr, struct_of_result = make_jaxpr(*arrays)
+    jaxpr, text_numbers = _numbers_apart(closed_jaxpr.jaxpr)
     # The leaves of the function come before those of the inputs. It has some if it is a
     # Module, or a `jax.tree_util.Partial`.
     fn_leaves = jtu.tree_leaves(fn)
     fn_arrays = [leaf for leaf in fn_leaves if eqx.is_array(leaf)]
     is_input_array = is_array[len(fn_leaves) :]
-    treedef_of_result = jtu.tree_structure(struct)
+    treedef_of_result = jtu.tree_structure(struct_of_result)
     program = _Program(jaxpr, is_input_array, treedef_of_result, static_results)
     # In the order of the constants and the first inputs of `jaxpr`.
-    numbers = [*map(jnp.asarray, closed.consts), *text_numbers, *fn_arrays]
+    consts = map(jnp.asarray, closed_jaxpr.consts)
+    numbers = [*consts, *text_numbers, *fn_arrays]
     return Traced(_interned(program, fn if identity is None else identity), numbers)
 
 

@@ -86,55 +86,77 @@ def choose(problem_for: Callable[[Want], Problem], request: Request) -> Decision
     `docs/expectation.md` states the rules. `problem_for` maps a purpose ("weak" or
     "strong"), for which the solver makes the paths that the user left open, to the
     problem."""
-    has_path, key, sampling, tol, start, engine, devices = request
+    engine = request.engine
     if engine not in (None, "jax", "drjit"):
         raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
-    if sampling is None and start is not None:
-        sampling = start.sampling
+    start = request.start
+    given = request.sampling
+    if given is None and start is not None:
+        given = start.sampling
 
-    problem, why_law = _problem_and_reason(problem_for, sampling, has_path)
-
-    why_sampling = ""
-    is_open = sampling is None
-    if is_open:
-        sampling, why_sampling = sampling_for(problem, tol, engine)
-    sampling = _checked_sampling(sampling, start)
-    if engine == "drjit":
-        plan = fused_plan(problem, key, sampling, devices)
+    problem, why_law = _problem_and_reason(problem_for, given, request.has_path)
+    if given is None:
+        sampling, plan, why_sampling = _best_sampling(problem, request)
     else:
-        plan = sampling.prepare(problem, trial_key(key), devices)
-
-    # The remainder is zero except for value functions.
-    if is_open and plan.remainder > _MOST_REMAINDER:
-        sorted_sampling = array_rqmc_for(problem, tol)
-        if sorted_sampling is not None:
-            why_sampling = (
-                "sorted paths, since fitted value functions leave "
-                f"{plan.remainder:.1%} of the standard error"
-            )
-            sampling = sorted_sampling
-            plan = sampling.prepare(problem, trial_key(key), devices)
-
+        sampling = _checked_sampling(given, start)
+        plan = _plan_for(problem, sampling, request)
+        why_sampling = ""
     reason = "; ".join(filter(None, [why_sampling, why_law, plan.reason]))
-    if start is not None:
-        reason = start.reason
     plan = plan._replace(
-        reason=reason, rounding_floor=problem.finest_steps, digests=problem.digests
+        reason=reason if start is None else start.reason,
+        rounding_floor=problem.finest_steps,
+        digests=problem.digests,
     )
-    if is_open and tol is None and isinstance(sampling, ArrayRQMC):
-        # First calls of five problems took 17, 18, 23, 24 and 27 s of processor time, in
-        # place of 20, 21, 27, 27 and 26, though paths then take up to 1.3 times as long.
-        plan = plan._replace(is_quick=True)
-    if is_open and isinstance(sampling, ValueFunctions):
-        # A path with a control variate takes far longer than another, so none is taken in
-        # vain.
-        least = int(plan.num_samples * _FRACTION_BESIDE_STEPS)
-        plan = plan._replace(least_beside_steps=least)
-    if start is not None and tol is None and plan.num_samples == _MOST_SAMPLES:
+    if start is not None and request.tol is None and plan.num_samples == _MOST_SAMPLES:
         # `start` had a tolerance, and this call has none: it takes no further samples.
         num_taken = start.moments[-1].end - start.moments[0].begin
         plan = plan._replace(num_samples=num_taken)
     return Decision(problem, sampling, plan)
+
+
+def _plan_for(
+    problem: Problem, sampling: AbstractSampling, request: Request
+) -> SamplingPlan:
+    """The plan of a sampling, for the engine that the user wants."""
+    if request.engine == "drjit":
+        return fused_plan(problem, request.key, sampling, request.devices)
+    return sampling.prepare(problem, trial_key(request.key), request.devices)
+
+
+class _Best(NamedTuple):
+    """The sampling that suits a problem best, its plan, and the reason."""
+
+    sampling: AbstractSampling
+    plan: SamplingPlan
+    reason: str
+
+
+def _best_sampling(problem: Problem, request: Request) -> _Best:
+    """The sampling that suits a problem best, by its sizes and by trials of a fit."""
+    tol = request.tol
+    sampling, reason = sampling_for(problem, tol, request.engine)
+    plan = _plan_for(problem, sampling, request)
+    # The remainder is zero except for value functions.
+    if plan.remainder > _MOST_REMAINDER:
+        sorted_sampling = array_rqmc_for(problem, tol)
+        if sorted_sampling is not None:
+            sampling = sorted_sampling
+            reason = (
+                "sorted paths, since fitted value functions leave "
+                f"{plan.remainder:.1%} of the standard error"
+            )
+            plan = _plan_for(problem, sampling, request)
+    if isinstance(sampling, ValueFunctions):
+        # A path with a control variate takes far longer than another, so none is taken in
+        # vain.
+        least = int(plan.num_samples * _FRACTION_BESIDE_STEPS)
+        plan = plan._replace(least_beside_steps=least)
+    if isinstance(sampling, ArrayRQMC) and tol is None:
+        # Compiling takes longer than so few paths, which then take up to 1.3 times as long.
+        # First calls of five problems took 17, 18, 23, 24 and 27 s of processor time, in
+        # place of 20, 21, 27, 27 and 26.
+        plan = plan._replace(is_quick=True)
+    return _Best(sampling, plan, reason)
 
 
 def _problem_and_reason(

@@ -373,9 +373,10 @@ def _trial_with_gaussian_increments(
 ) -> Expectation:
     """An estimate of the same mean, with Gaussian increments in place of those of `terms`,
     for a solver that takes them. `key` is that of the call."""
-    numbers = motion_numbers(random_paths(problem.terms))
-    gaussian_path = ft.partial(own_path, problem.solver, "strong")
-    terms = with_paths(gaussian_path, numbers, problem.terms, key)
+    # Paths that are one Brownian motion become one again.
+    motions = motion_numbers(random_paths(problem.terms))
+    make_gaussian_path = ft.partial(own_path, problem.solver, "strong")
+    terms = with_paths(make_gaussian_path, motions, problem.terms, key)
     gaussian_problem = dataclasses.replace(problem, terms=terms)
     sampling = trial_sampling(gaussian_problem)
     key_of_trial = trial_key(key)

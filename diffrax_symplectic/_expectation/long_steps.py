@@ -9,7 +9,6 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
-import jax.tree_util as jtu
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
@@ -146,30 +145,29 @@ def _unresolved_frequency(
 
 
 def _lost_decay(problem: Problem, dt0: float) -> str | None:
-    """`too_long_steps` for an implicit solver and modes that decay slowly and turn far in a
-    step: it hardly lets them decay, on any level."""
+    """`too_long_steps` for an implicit solver, if a mode should decay, but turns so far in
+    a step that the step keeps its amplitude, on every level."""
     largest_angle, step_number = _largest_angle(problem)
     if not largest_angle > _TURNS_TOO_FAR_TO_DECAY:
         return None
-    num_modes = sum(np.size(leaf) for leaf in jtu.tree_leaves(problem.y0))
-    if num_modes > _MOST_MODES:
+    if problem.num_components > _MOST_MODES:
         return None
+    # Of the part of the drift that the equations of a step contain, at `y0`.
     jacobian = np.asarray(_quick_jacobian(problem, step_number), float)
     # A mode decays with the negative real part of its eigenvalue, and turns with the
     # imaginary part.
     eigenvalues = np.linalg.eigvals(jacobian)
     decay_rates = -eigenvalues.real
     duration = float(problem.level(0).num_steps) * dt0
-    least_rate = max(
-        _LEAST_DECAY / duration, _ROUNDING_OF_RATES * np.max(np.abs(eigenvalues))
-    )
-    is_kept = np.abs(eigenvalues.imag) * dt0 > _TURNS_TOO_FAR_TO_DECAY
-    is_kept &= decay_rates > least_rate
+    rounding = _ROUNDING_OF_RATES * np.max(np.abs(eigenvalues))
+    least_rate = max(_LEAST_DECAY / duration, rounding)
+    turns_too_far = np.abs(eigenvalues.imag) * dt0 > _TURNS_TOO_FAR_TO_DECAY
+    is_wrongly_kept = turns_too_far & (decay_rates > least_rate)
     # Without friction, modes grow and decay in pairs, and these rates add up to zero.
     is_dissipative = np.sum(decay_rates) > least_rate
-    if not np.any(is_kept) or not is_dissipative:
+    if not np.any(is_wrongly_kept) or not is_dissipative:
         return None
-    angle = np.max(np.abs(eigenvalues.imag[is_kept])) * dt0
+    angle = np.max(np.abs(eigenvalues.imag[is_wrongly_kept])) * dt0
     return (
         f"Steps of `dt0={dt0:g}` are too long for `{type(problem.solver).__name__}` "
         f"{_where_step_begins(problem, step_number)}: a mode with "

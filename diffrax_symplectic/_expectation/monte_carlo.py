@@ -160,15 +160,19 @@ def monte_carlo(
 def _outputs(
     programs: list[Traced], key: PRNGKeyArray, num_combinations: int
 ) -> Outputs:
-    """The numbers of phi, from the program of each level."""
-    structs = [jax.eval_shape(program, key)[0] for program in programs]
+    """The numbers of phi, from the program of each level. Raises a `ValueError` unless phi
+    has the same layout on all levels."""
+    structs = []
+    for program in programs:
+        struct_of_phi, _ = jax.eval_shape(program, key)
+        structs.append(struct_of_phi)
     layout, *other_layouts = map(Layout.of, structs)
     if any(other != layout for other in other_layouts):
         raise ValueError(
             "`fn` must return a phi of the same structure and shapes on all levels; got "
             f"{', '.join(map(shapes, structs))}."
         )
-    # Rounding errors are estimated by the least precise of the dtypes.
+    # Rounding errors are those of the least precise of the dtypes.
     dtypes = {leaf.dtype for leaf in jtu.tree_leaves(structs)}
     dtype = min(dtypes, key=lambda dtype: jnp.finfo(dtype).bits)
     return Outputs(layout, len(programs), num_combinations, str(dtype))

@@ -78,8 +78,8 @@ class Batch(NamedTuple):
 def by_jax(
     problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> Batch:
-    """The paths with these sample numbers, on one level, simulated by JAX, with the loop of
-    `expectation`, which simulates all levels."""
+    """The paths with these sample numbers on one level, simulated by JAX. The loop is that
+    of `expectation`, which runs all levels of the problem: the others are dropped."""
     high, low = _words(sample_numbers)
     states_and_failed = _paths_by_jax(problem.with_any_steps(), key, high, low)
     # The results are traced if a function of the user closes over traced values.

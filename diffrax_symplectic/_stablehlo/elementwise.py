@@ -141,17 +141,22 @@ def _power(base, exponent):
         value = exponent[0]
         if float(value).is_integer() and abs(value) <= _MOST_MULTIPLIED:
             return _whole_power(base, int(value))
+    return _power_by_logarithm(base, exponent)
+
+
+def _power_by_logarithm(base, exponent):
+    """The power for any exponent. The last of the cases below that applies prevails."""
     dr = drjit()
     dtype = type(base)
     power_of_size = dr.exp(dr.log(dr.abs(base)) * exponent)
     # A negative number has real powers for whole exponents only, negative for odd ones.
     is_whole = dr.floor(exponent) == exponent
     is_odd = dr.floor(exponent / 2) * 2 != exponent
-    whole_power = dr.select(is_odd, -power_of_size, power_of_size)
+    negative_to_whole = dr.select(is_odd, -power_of_size, power_of_size)
     # As in JAX, minus infinity has powers for other exponents, too.
-    other_power = dr.select(dr.isinf(base), power_of_size, dtype(np.nan))
-    of_negative = dr.select(is_whole, whole_power, other_power)
-    by_logarithm = dr.select(base < 0, of_negative, power_of_size)
+    negative_to_fraction = dr.select(dr.isinf(base), power_of_size, dtype(np.nan))
+    power_of_negative = dr.select(is_whole, negative_to_whole, negative_to_fraction)
+    by_logarithm = dr.select(base < 0, power_of_negative, power_of_size)
     # The product of logarithm and exponent may be infinity times zero, which is NaN: for a
     # base of zero or one, and for an exponent of zero.
     power = dr.select((base == 0) & (exponent > 0), dtype(0), by_logarithm)

@@ -79,12 +79,14 @@ class Replay:
         """The results, and masks of the lanes that raise an error.
 
         `constants` are what `self.constants()` returned. Without it, large constants are
-        written into the kernel.
+        written into the kernel. One call at a time: they are kept during the call.
         """
-        failures: list[Any] = []
         # `_results` looks here whether a constant is in memory; empty without `constants`.
         self._memory = dict(zip(self._constants, constants))
-        return self._call("main", args, failures), failures
+        # Operations that fail append their masks.
+        failures: list[Any] = []
+        results = self._call("main", args, failures)
+        return results, failures
 
     def _call(
         self, name: str, args: Sequence[Tensor], failures: list[Any]

@@ -149,11 +149,14 @@ def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
 
     def value(flat_y: Float[Array, " d"], key: PRNGKeyArray | None = None) -> Array:
         y = unravel(flat_y)
-        x = None
+        variables = None
         if key is not None:
-            # The pilot's own steps draw by the indices below `most_steps`.
-            x, _ = noise.draw(key, problem.most_steps + i, cuts_of(noise.laws))
-        mean = noise.mean(next_step, y, lambda y1: fitted(next_step, y1), x)
+            # Draws by one key are numbered. The pilot's own steps have the numbers below
+            # `most_steps`.
+            number = problem.most_steps + i
+            variables, _ = noise.draw(key, number, cuts_of(noise.laws))
+        # (C, S, m), and `phi` (m).
+        mean = noise.mean(next_step, y, ft.partial(fitted, next_step), variables)
         phi = problem.values(problem.t0 + (i + 1) * level.h, y).astype(mean.dtype)
         # Which of the times at which to average are the end of this step, or later.
         is_end_of_step = level.saved_steps == i + 1

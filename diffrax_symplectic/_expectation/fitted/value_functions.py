@@ -44,7 +44,7 @@ from .noise import Noise
 # to draw fits, are smaller.)
 _TRIAL_KEY = 0xFFFFFFFE
 # From the code that calls `expectation` to `prepare`, counted as for `warnings.warn`.
-_FRAMES_TO_USER = 5
+_FRAMES_TO_USER = 6
 
 
 @saved_by_name

@@ -134,7 +134,7 @@ class ArrayRQMC(AbstractSampling):
         num_coordinates = jax.eval_shape(lambda: real_vector(sort_by(problem.y0))).size
         check_memory("num_paths", self.num_paths, problem.bytes_of_state, devices[0])
         points = jnp.asarray(sobol_points(self.num_paths, layout.num_words))
-        _warn_of_many_coordinates(self.num_paths, num_coordinates, stacklevel=5)
+        _warn_of_many_coordinates(self.num_paths, num_coordinates, stacklevel=6)
 
         def plan_for(any_steps: Problem) -> SamplingPlan:
             return SamplingPlan(

@@ -46,13 +46,14 @@ _OFF = (
 def check_start(
     terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Raises a `ValueError` unless masses are constant, if the constraints are dependent at
-    `y0`, or if `y0` is off them.
+    """Checks that a solve with constraints can start at `y0`. Raises a `ValueError` for
+    masses that are not constant.
 
-    Returns the last two as flags, since values may be traced. A flag that is then true is
-    an error when run, except in a batch: there the caller makes its path fail."""
+    Returns two flags: whether the constraints are dependent at `y0`, and whether `y0` is
+    off them. A flag that is true raises a `ValueError` if it is known, and otherwise an
+    error when run, except in a batch: there the caller makes its path fail."""
     _check_constant_masses(terms, t0, y0, args)
-    # Under `grad` a derivative of the flags would be traced, which is zero.
+    # Flags have no derivative, which `grad` would trace all the same.
     fixed_y0, fixed_args = jtu.tree_map(_without_derivative, (y0, args))
     is_dependent, is_off = _start_faults(terms, t0, fixed_y0, fixed_args)
     return refused_where(is_dependent, _DEPENDENT), refused_where(is_off, _OFF)
