@@ -159,7 +159,7 @@ def test_the_page_of_expectation_states_the_rule_of_the_default():
         f"{ds.ValueFunctions().num_paths:,} paths |",
         "| at most four components |",
         f"| `ArrayRQMC` | {sorted_paths.replicates} × {sorted_paths.num_paths:,} paths |",
-        f"| `IndependentPaths` | {choose._PATHS:,} paths |",
+        f"| `IndependentPaths` | {choose._MOST_INDEPENDENT_PATHS:,} paths |",
         "a few seconds up to 410 steps on all levels; each further mean costs a third more",
         f"more than about {choose._SECONDS_OF_PATHS} seconds",
     )
