@@ -6,7 +6,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool
 
 from .._compat import dce_jaxpr, Jaxpr, programs_in
 from .._custom_types import Y
@@ -70,7 +70,7 @@ def operations_per_step(problem: Problem) -> int:
     return max(1, _count_operations(traced.jaxpr))
 
 
-def _first_step(problem: Problem, y: Y) -> tuple[Y, Float[Array, ""]]:
+def _first_step(problem: Problem, y: Y) -> tuple[Y, Bool[Array, ""]]:
     """The state after step 0 from `y`, and whether the step succeeded."""
     i = jnp.zeros((), jnp.int32)
     h = problem.level(i).h

@@ -187,7 +187,7 @@ def unresolved_angle(problem: Problem) -> float | None:
     return angle if angle > _RESOLVED else None
 
 
-def _largest_angle(problem: Problem) -> tuple[float, float]:
+def _largest_angle(problem: Problem) -> tuple[float, np.floating]:
     """The largest angle by which a step on the first level turns the state in which paths
     start, by the drift without friction, in radians; and the number of this step."""
     step_numbers = _step_numbers_to_look_at(problem)

@@ -409,11 +409,14 @@ class Problem(eqx.Module):
 
 @once_for_each_signature
 def _structs_of_values(
-    phi: Callable[..., PyTree[ArrayLike]], t0: Array, y0: Y, args: Args
+    phi: Callable[..., PyTree[ArrayLike]],
+    t0: Float[Array | np.ndarray, ""],
+    y0: Y,
+    args: Args,
 ) -> tuple[PyTree[jax.ShapeDtypeStruct], jax.ShapeDtypeStruct]:
     """The shapes and dtypes of `phi`, and of all its numbers as one vector."""
 
-    def as_tree_and_vector() -> tuple[PyTree[Array], Array]:
+    def as_tree_and_vector() -> tuple[PyTree[ArrayLike], Array]:
         value = phi(t0, y0, args)
         return value, real_vector(value)
 

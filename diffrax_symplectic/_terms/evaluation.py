@@ -25,7 +25,7 @@ NEED_VALUES = (
 
 def call_user_function(
     name: str, function: Callable, *inputs: PyTree, args: Args
-) -> PyTree[Array]:
+) -> Any:
     """Returns `function(*inputs, args)`, where `function` is the user's argument of this
     name. Its errors while JAX traces it are raised with advice."""
     # The function gets a copy: if it modifies `args` in place, each trace still has the
