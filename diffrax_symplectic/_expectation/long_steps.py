@@ -256,7 +256,7 @@ def _step_numbers_to_look_at(problem: Problem) -> Float[np.ndarray, " times"]:
     return np.floor(spread_evenly(_NUM_TIMES) * num_steps).astype(problem.dtype)
 
 
-def _where_step_begins(problem: Problem, step_number: float) -> str:
+def _where_step_begins(problem: Problem, step_number: float | np.floating) -> str:
     """Where a step on the first level begins, for messages."""
     if step_number == 0:
         return "where paths start"
