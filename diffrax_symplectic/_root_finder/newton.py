@@ -144,11 +144,12 @@ class Newton(eqx.Module):
         is_solved = has_converged & is_whole_step & is_correct
         is_near = max_norm(newton.change) < _TOLERANCE_OF_PART * size_of_iterate
         part_is_solved = is_near & ~is_whole_step
-        progress = progress._replace(
+        next_progress = progress._replace(
             tries=progress.tries + 1, size=size, is_solved=is_solved
         )
-        has_failed = _cannot_go_on(progress, shrinkage) & ~part_is_solved & ~is_solved
-        return _next_target(progress, next_k, part_is_solved, has_failed)
+        cannot_go_on = _cannot_go_on(next_progress, shrinkage, is_whole_step)
+        has_failed = cannot_go_on & ~part_is_solved & ~is_solved
+        return _next_target(next_progress, next_k, part_is_solved, has_failed)
 
     def _is_correct(
         self,
@@ -169,10 +170,12 @@ class Newton(eqx.Module):
         return newton.found & residual_fits & all_finite(next_k)
 
 
-def _cannot_go_on(progress: Progress, shrinkage: Scalar) -> Bool[Array, ""]:
+def _cannot_go_on(
+    progress: Progress, shrinkage: Scalar, is_whole_step: Bool[Array, ""]
+) -> Bool[Array, ""]:
     """Whether further iterations would not reach the target: where the last correction is
-    not finite, is not smaller than the one before by enough, or is one of too many."""
-    is_whole_step = progress.target == 1
+    not finite, is not smaller than the one before by enough, or is one of too many.
+    `is_whole_step` is whether the target is the end of the step."""
     # The whole step at once is tried first, from a guess that may be poor. The last part of
     # a continuation has the same target, but begins near a solution, or fails soon.
     is_first_try = is_whole_step & (progress.reached == 0)
