@@ -99,9 +99,9 @@ def trial_with_finer_level(
     if changes.are_sure:
         h = float(problem.levels.h[-1]) / 2
         return Trial(message=_message(estimate, changes, h))
-    # The same sampling with fewer samples always has the larger standard error. That it
-    # hides changes is then no sign that something is wrong.
-    if is_fitted or has_same_sampling or not changes.are_hidden:
+    # Next to value functions the standard error of fewer samples is always the larger one,
+    # which says little of resolved steps.
+    if is_fitted or not changes.are_hidden:
         return Trial()
     if angle is None:
         return Trial(caveat=_caveat(estimate, changes))

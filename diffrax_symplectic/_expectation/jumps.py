@@ -184,20 +184,17 @@ def _jumping_stages(
         fields["forces jump"] = drift_field(drift, problem.args)
     if noise and len(drift_stages) < len(stages_at_ends):
         fields["noise jumps"] = noise_field(noise, problem.args)
-    ends = {
-        what_happens: _first_jump_at_end(field, problem, problem.y0)
-        for what_happens, field in fields.items()
-    }
-    jumps = [(what, end) for what, end in ends.items() if end is not None]
-    if not jumps:
-        return None
-    what_happens, end = jumps[0]
-    return (
-        f"The {what_happens} at step ends, such as t={end:.6g}, and "
-        f"`{type(solver).__name__}` takes one side of the jump for both steps: the mean "
-        "converges to first order only, and two levels do not see it. Pass a solver that "
-        "takes forces and noise within steps, such as `ImplicitMidpoint()`."
-    )
+    for what_happens, field in fields.items():
+        end = _first_jump_at_end(field, problem, problem.y0)
+        if end is not None:
+            return (
+                f"The {what_happens} at step ends, such as t={end:.6g}, and "
+                f"`{type(solver).__name__}` takes one side of the jump for both steps: the "
+                "mean converges to first order only, and two levels do not see it. Pass a "
+                "solver that takes forces and noise within steps, such as "
+                "`ImplicitMidpoint()`."
+            )
+    return None
 
 
 def _steps_to_look_at(problem: Problem) -> _Steps | None:

@@ -7,6 +7,7 @@ import pytest
 from jax import monitoring
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation import finer_level
 from diffrax_symplectic._expectation.fitted.noise import Noise
 from diffrax_symplectic._simulation.problem import Problem
 
@@ -123,3 +124,21 @@ def test_xla_does_not_know_the_result_before_a_step_of_a_fit():
     noise = Noise.of(problem, problem.level(0))
     program = jax.jit(lambda y: noise.new_solver_state(0, y)).lower(y0).as_text()
     assert "optimization_barrier" in program
+
+
+@pytest.mark.parametrize("sampling", [ds.ValueFunctions(2, 64), ds.ArrayRQMC(64, 8)])
+def test_a_trial_with_halved_steps_compiles_nothing(monkeypatch, sampling):
+    changes_of = finer_level._changes_by_same_sampling
+    names = []
+
+    def changes(*args):
+        before = len(compiled)
+        result = changes_of(*args)
+        names.append(compiled[before:])
+        return result
+
+    monkeypatch.setattr(finer_level, "_changes_by_same_sampling", changes)
+    call(mean, dict(sampling=sampling))
+    (names_of_trial,) = names
+    # Those of samples and of fits. Small ones, of keys, do not count.
+    assert not [name for name in names_of_trial if "of_arrays" in name]

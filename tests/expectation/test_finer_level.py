@@ -64,6 +64,14 @@ def test_a_resolved_encounter_is_not_told():
     assert message is None
 
 
+def test_sorted_paths_say_which_changes_their_trial_could_not_see():
+    square = lambda t, y, args: y[1] ** 2
+    given = square, DRIVEN, ds.StormerVerlet(), 0, 1, 0.1, (jnp.zeros(()), jnp.ones(()))
+    got, message = _told(*given, sampling=ds.ArrayRQMC(256, 8))
+    assert message is None
+    assert "a trial with halved steps, on 512 paths, could only see" in str(got)
+
+
 def _oscillator(t, p, q, args):
     return (p**2 + q**2) / 2
 

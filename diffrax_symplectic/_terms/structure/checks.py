@@ -148,12 +148,10 @@ def separable_fault(
     drift_traces = trace((*frictionless, *friction))
     noise_traces = trace(noise)
     keeps_half = ft.partial(_keeps_half, t0, y0, args)
-    faults, faults_if_exchanged = [
-        _separable_faults(momentum_half, drift_traces, noise_traces, keeps_half)
-        for momentum_half in (0, 1)
-    ]
+    faults = _separable_faults(0, drift_traces, noise_traces, keeps_half)
     if len(faults) == 0:
         return None
+    faults_if_exchanged = _separable_faults(1, drift_traces, noise_traces, keeps_half)
     first = faults[0]
     by_friction = first._replace(advice=f"{FRICTION} {first.advice}", friction=True)
     if all(fault.friction for fault in faults):
