@@ -225,139 +225,93 @@ def compare_solvers(
         _check_scalar(phi, t1, y0, args)
         phi = traced(phi, jnp.asarray(t1, float), y0, args)
     terms = with_programs(terms, t0, y0, args)
-    system = _ComparedSystem(terms, t0, t1, y0, args, phi, key, num_paths)
+    is_strong = want == "strong"
     reference_dt = min(dts) / _REFERENCE_STEPS
-    solve_for_reference = system.solve_to_compare(reference, reference_dt)
-    exact = solve_for_reference(system.keys(_COMMON_BATCH), jnp.asarray(reference_dt))
+    solve_along = ft.partial(_solve_batch, terms, t0, t1, y0, args, phi)
+
+    def keys(batch_number: int) -> Key[Array, " num_paths"]:
+        return jr.split(jr.fold_in(key, batch_number), num_paths)
+
+    def solve_with_own_path(solver: diffrax.AbstractSolver) -> _SolveBatch:
+        return solve_along(solver, ft.partial(own_path, solver, want))
+
+    def solve_to_compare(solver: diffrax.AbstractSolver) -> _SolveBatch:
+        # Strong errors need a common Brownian motion, which not all solvers can use.
+        if is_strong:
+            return solve_along(solver, ft.partial(common_path, solver, reference_dt))
+        return solve_with_own_path(solver)
+
+    common_keys = keys(_COMMON_BATCH)
+    exact = solve_to_compare(reference)(common_keys, jnp.asarray(reference_dt))
     # The results are traced if a function of the user closes over traced values.
     check_untraced("`compare_solvers`", exact)
     steps = []
     refused = {}
     for solver in solvers:
+        compared_solve = solve_to_compare(solver)
         try:
-            steps += _compared_steps(system, solver, dts, exact, reference_dt)
-        except _Refused as refusal:
-            refused[repr(solver)] = str(refusal)
+            # Refusals are errors while tracing, so that nothing need be compiled for them.
+            eqx.filter_eval_shape(compared_solve, common_keys, jnp.asarray(dts[0]))
+        except ValueError as error:
+            refused[repr(solver)] = str(error).splitlines()[0]
+            continue
+        # Times are measured with the solver's own path, since a common one may take longer.
+        timed_solve = solve_with_own_path(solver) if is_strong else compared_solve
+        # The first call compiles, and is not timed.
+        jax.block_until_ready(timed_solve(keys(1), jnp.asarray(dts[0])))
+        # Each step size has a batch of its own, since weak errors are from independent
+        # paths. (Strong ones are measured along the common batch.)
+        for batch_number, dt in enumerate(dts, start=1):
+            keys_of_batch = keys(batch_number)
+            # With a number in place of an array the program would compile anew.
+            dt_array = jnp.asarray(dt)
+            begin = time.perf_counter()
+            results = jax.block_until_ready(timed_solve(keys_of_batch, dt_array))
+            seconds = (time.perf_counter() - begin) / num_paths
+            if is_strong:
+                measured = strong_error(compared_solve(common_keys, dt_array), exact)
+            else:
+                measured = weak_error(results, exact)
+            step = ComparedStep(
+                solver=repr(solver), dt=dt, seconds=seconds, **measured._asdict()
+            )
+            steps.append(step)
     return Comparison(want, tuple(steps), refused)
 
 
-class _ComparedSystem(NamedTuple):
-    """The arguments of `compare_solvers` that all compared solvers share."""
-
-    terms: diffrax.AbstractTerm
-    t0: float
-    t1: float
-    y0: Y
-    args: Args
-    phi: Callable[[RealScalarLike, Y, Args], ArrayLike] | None
-    key: PRNGKeyArray
-    num_paths: int
-
-    @property
-    def is_strong(self) -> bool:
-        """Whether errors are those of paths, rather than of means."""
-        return self.phi is None
-
-    def keys(self, batch_number: int) -> Key[Array, " num_paths"]:
-        """The keys of the paths of a batch."""
-        return jr.split(jr.fold_in(self.key, batch_number), self.num_paths)
-
-    def solve_with_own_path(self, solver: diffrax.AbstractSolver) -> _SolveBatch:
-        """The function that solves along the path that the solver makes for the shape of a
-        path in `terms`."""
-        want = "strong" if self.is_strong else "weak"
-        return self._solve_batch(solver, ft.partial(own_path, solver, want))
-
-    def solve_to_compare(
-        self, solver: diffrax.AbstractSolver, reference_dt: float
-    ) -> _SolveBatch:
-        """The function that solves for the results whose error is measured."""
-        if not self.is_strong:
-            return self.solve_with_own_path(solver)
-        # Strong errors need a common Brownian motion, which not all solvers can use.
-        return self._solve_batch(solver, ft.partial(common_path, solver, reference_dt))
-
-    def _solve_batch(
-        self, solver: diffrax.AbstractSolver, make_path: Callable
-    ) -> _SolveBatch:
-        """The function that solves along the paths of `make_path`, as for `with_paths`,
-        compiled."""
-        terms, t0, t1, y0, args, phi, *_ = self
-        solver = with_programs(solver, t0, y0, args)
-        # Terms with equal numbers get the same path, since they shared one before.
-        numbers = motion_numbers(random_paths(terms))
-
-        @eqx.filter_jit
-        @lapack_in_turn
-        @ft.partial(jax.vmap, in_axes=(0, None))
-        def results(key: PRNGKeyArray, dt: Array) -> PathResults:
-            # Increments are not truncated: paths fail where a step has no solution, and are
-            # counted.
-            own_terms = with_paths(make_path, numbers, terms, key)
-            check_stratonovich(own_terms, solver, t0, y0, args)
-            sol = diffrax.diffeqsolve(
-                own_terms, solver, t0, t1, dt, y0, args, max_steps=None,
-                adjoint=diffrax.ForwardMode(), throw=False,
-            )  # fmt: skip
-            y1 = jtu.tree_map(lambda y: y[-1], sol.ys)
-            result = y1 if phi is None else phi(t1, y1, args)
-            return PathResults(result, diffrax.is_okay(sol.result))
-
-        return results
-
-
-class _Refused(Exception):
-    """A solver does not accept the terms, for the reason in the message."""
-
-
-def _compared_steps(
-    system: _ComparedSystem,
+def _solve_batch(
+    terms: diffrax.AbstractTerm,
+    t0: float,
+    t1: float,
+    y0: Y,
+    args: Args,
+    phi: Callable[[RealScalarLike, Y, Args], ArrayLike] | None,
     solver: diffrax.AbstractSolver,
-    dts: list[float],
-    exact: PathResults,
-    reference_dt: float,
-) -> list[ComparedStep]:
-    """Measures a solver with each step size. Raises `_Refused` if it does not accept the
-    terms."""
-    # Strong errors need another path than a solver gets by itself, which may take longer.
-    # So times are measured with the latter.
-    timed_solve = system.solve_with_own_path(solver)
-    compared_solve = timed_solve
-    if system.is_strong:
-        compared_solve = system.solve_to_compare(solver, reference_dt)
-    common_keys = system.keys(_COMMON_BATCH)
-    try:
-        # Refusals are errors while tracing, so that nothing need be compiled for them.
-        eqx.filter_eval_shape(compared_solve, common_keys, jnp.asarray(dts[0]))
-    except ValueError as error:
-        raise _Refused(str(error).splitlines()[0]) from None
-    # The first call compiles, and is not timed.
-    jax.block_until_ready(timed_solve(system.keys(1), jnp.asarray(dts[0])))
-    steps = []
-    # Each step size has a batch of its own, since weak errors are from independent paths.
-    # (Strong ones are measured along the common batch.)
-    for batch_number, dt in enumerate(dts, start=1):
-        # The step size is an array: with a number the program would compile anew.
-        dt_array = jnp.asarray(dt)
-        keys = system.keys(batch_number)
-        begin = time.perf_counter()
-        results = jax.block_until_ready(timed_solve(keys, dt_array))
-        seconds = (time.perf_counter() - begin) / system.num_paths
-        if system.is_strong:
-            measured = strong_error(compared_solve(common_keys, dt_array), exact)
-        else:
-            measured = weak_error(results, exact)
-        steps.append(
-            ComparedStep(
-                solver=repr(solver),
-                dt=float(dt_array),
-                error=measured.error,
-                std_error=measured.std_error,
-                seconds=seconds,
-                num_failed=measured.num_failed,
-            )
-        )
-    return steps
+    make_path: Callable,
+) -> _SolveBatch:
+    """The compiled function that solves along the paths of `make_path`, as for
+    `with_paths`."""
+    solver = with_programs(solver, t0, y0, args)
+    # Terms with equal numbers get the same path, since they shared one before.
+    numbers = motion_numbers(random_paths(terms))
+
+    @eqx.filter_jit
+    @lapack_in_turn
+    @ft.partial(jax.vmap, in_axes=(0, None))
+    def results(key: PRNGKeyArray, dt: Array) -> PathResults:
+        # Increments are not truncated: paths fail where a step has no solution, and are
+        # counted.
+        own_terms = with_paths(make_path, numbers, terms, key)
+        check_stratonovich(own_terms, solver, t0, y0, args)
+        sol = diffrax.diffeqsolve(
+            own_terms, solver, t0, t1, dt, y0, args, max_steps=None,
+            adjoint=diffrax.ForwardMode(), throw=False,
+        )  # fmt: skip
+        y1 = jtu.tree_map(lambda y: y[-1], sol.ys)
+        result = y1 if phi is None else phi(t1, y1, args)
+        return PathResults(result, diffrax.is_okay(sol.result))
+
+    return results
 
 
 def strong_error(compared: PathResults, exact: PathResults) -> _MeasuredError:
@@ -374,16 +328,12 @@ def strong_error(compared: PathResults, exact: PathResults) -> _MeasuredError:
     )
     squares = np.concatenate(leaves, axis=1).sum(axis=1)
     mean_square, std_error_of_mean_square = _mean_and_std_error(squares, okay)
+    root_mean_square = math.sqrt(mean_square)
+    # The derivative of the square root is 1 / (2 sqrt).
     # If there is no difference at all, 0 / 0 makes the standard error NaN.
     with np.errstate(all="ignore"):
-        root_mean_square = np.sqrt(mean_square)
-        # The derivative of the square root is 1 / (2 sqrt).
-        std_error = std_error_of_mean_square / (2 * root_mean_square)
-    return _MeasuredError(
-        error=float(root_mean_square),
-        std_error=float(std_error),
-        num_failed=int(np.sum(~okay)),
-    )
+        std_error = np.divide(std_error_of_mean_square, 2 * root_mean_square)
+    return _MeasuredError(root_mean_square, float(std_error), int(np.sum(~okay)))
 
 
 def weak_error(compared: PathResults, exact: PathResults) -> _MeasuredError:
@@ -391,12 +341,10 @@ def weak_error(compared: PathResults, exact: PathResults) -> _MeasuredError:
     solver."""
     mean, std_error = _mean_and_std_error(compared.results, compared.okay)
     exact_mean, exact_std_error = _mean_and_std_error(exact.results, exact.okay)
-    return _MeasuredError(
-        error=abs(mean - exact_mean),
-        # Both means are from independent paths, so their variances add up.
-        std_error=math.hypot(std_error, exact_std_error),
-        num_failed=int(np.sum(~np.asarray(compared.okay))),
-    )
+    # Both means are from independent paths, so their variances add up.
+    std_error_of_difference = math.hypot(std_error, exact_std_error)
+    num_failed = int(np.sum(~np.asarray(compared.okay)))
+    return _MeasuredError(abs(mean - exact_mean), std_error_of_difference, num_failed)
 
 
 def _mean_and_std_error(values: Any, okay: Any) -> tuple[float, float]:

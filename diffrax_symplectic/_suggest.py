@@ -34,7 +34,6 @@ from ._solver import (
     own_path,
     PlateauGauss,
     PlateauVerlet,
-    Record,
     SRKs2,
     SRKs4,
     SRKw1,
@@ -225,40 +224,35 @@ def suggest_solver(
     constrained = constraint_of(given_terms) is not None
     system = _inspect(drift, noise, t0, y0, args, constrained)
     paths = brownian_paths(noise)
-    solvers = _suitable(system, want, paths, one_term=len(noise) == 1)
-
     numbers = motion_numbers(random_paths(terms))
     # For each path, whether implicit steps need its increments bounded.
     needs_truncation = which_need_truncation(terms, t0, y0, args)
-
-    def terms_for(solver: AbstractSymplecticSolver) -> jtu.Partial:
-        """The function of a key that returns the terms with paths of this solver."""
+    suggestions = []
+    for solver in _suitable(system, want, paths, one_term=len(noise) == 1):
+        assert solver.record is not None
         is_implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-        which_truncated = tuple(is_implicit and needed for needed in needs_truncation)
-        make_path = ft.partial(own_path, solver, want)
-        return jtu.Partial(
-            ft.partial(_terms_with_paths, make_path, numbers, which_truncated),
-            given_terms,
+        terms_of_key = ft.partial(
+            _terms_with_paths,
+            ft.partial(own_path, solver, want),
+            numbers,
+            tuple(is_implicit and needed for needed in needs_truncation),
         )
-
-    suggestions = tuple(
-        _suggestion(
-            solver,
-            want,
-            terms,
-            commute=system.commute,
-            needs_bounded=any(needs_truncation),
-            terms_of_key=terms_for(solver),
+        suggestion = Suggestion(
+            solver=solver,
+            weak_order=cast(int, solver.record.order("weak", system.commute)),
+            strong_order=solver.record.order("strong", system.commute),
+            path=_path_code(solver, want, terms, any(needs_truncation)),
+            reason=solver.record.reason,
+            terms=jtu.Partial(terms_of_key, given_terms),
         )
-        for solver in solvers
-    )
+        suggestions.append(suggestion)
     description = f"For {want} approximation. {system.in_a_sentence()}"
     if any(isinstance(path, diffrax.UnsafeBrownianPath) for path in paths):
         description += (
             " Its `diffrax.UnsafeBrownianPath` rounds times to 32 bits and repeats its "
             "noise late in a run (Diffrax issue 733): use one of the paths below."
         )
-    return Suggestions(description, suggestions)
+    return Suggestions(description, tuple(suggestions))
 
 
 def _terms_with_paths(
@@ -274,13 +268,13 @@ def _terms_with_paths(
     return with_truncation(with_paths(make_path, numbers, terms, key), which_truncated)
 
 
-class _System(NamedTuple):
+class System(NamedTuple):
     """What decides which solvers suit a system.
 
-    - `structures`: the structures that it has.
-    - `fault`: why it is not separable; `None` if it is.
+    - `structures`: the structures that it has, beside `"any"`.
+    - `commute`: whether its noises commute, as far as is known.
     - `num_noises`: the number of its scalar Brownian motions.
-    - `commute`: whether these commute, as far as is known.
+    - `fault`: why it is not separable; `None` if it is.
     - `friction`: whether it has friction that solvers for heat baths, such as `BAOAB()`,
         treat by a step of its own.
     - `general_bath`: whether it has friction that only `BAOAB(ImplicitMidpoint())` treats
@@ -290,14 +284,14 @@ class _System(NamedTuple):
     - `constrained`: whether its positions are constrained.
     """
 
-    structures: list[Structure]
-    fault: Fault | None
-    num_noises: int
+    structures: Collection[Structure]
     commute: bool
-    friction: bool
-    general_bath: bool
-    friction_in_drift: bool
-    constrained: bool
+    num_noises: int
+    fault: Fault | None = None
+    friction: bool = False
+    general_bath: bool = False
+    friction_in_drift: bool = False
+    constrained: bool = False
 
     def in_a_sentence(self) -> str:
         """The structure of the system, such as "The system is separable, with friction and
@@ -328,7 +322,7 @@ class _System(NamedTuple):
 
 def _inspect(
     drift: Terms, noise: Terms, t0: Array, y0: Y, args: Args, constrained: bool
-) -> _System:
+) -> System:
     """The structure of the system, found by tracing its terms."""
     fault = separable_fault(drift, noise, t0, y0, args)
     structures: list[Structure] = [] if fault else ["separable"]
@@ -356,7 +350,7 @@ def _inspect(
         and not constrained
         and accepts_friction(terms, t0, y0, args, _BATH_OF_ANY_ENERGY)
     )
-    return _System(
+    return System(
         structures=structures,
         fault=fault,
         num_noises=num_noises,
@@ -369,7 +363,7 @@ def _inspect(
 
 
 def _suitable(
-    system: _System,
+    system: System,
     want: Want,
     paths: list[diffrax.AbstractBrownianPath],
     one_term: bool,
@@ -377,15 +371,7 @@ def _suitable(
     """The solvers for a system, best first. `paths` are the paths of its noises, and
     `one_term` says whether one term holds all noises. Raises a `ValueError` if no solver
     keeps the constraints of the system."""
-    solvers = ranked(
-        want,
-        system.structures,
-        commute=system.commute,
-        num_noises=system.num_noises,
-        friction=system.friction,
-        general_bath=system.general_bath,
-        friction_in_drift=system.friction_in_drift,
-    )
+    solvers = ranked(want, system)
     if system.constrained:
         solvers = [solver for solver in solvers if solver.keeps_constraints]
         if system.friction:
@@ -398,7 +384,11 @@ def _suitable(
             )
     if not one_term or not jtu.all_leaves([increment_struct(paths[0])]):
         # Lévy areas are only sampled between the noises of one array.
-        solvers = [solver for solver in solvers if not _needs_areas(solver)]
+        solvers = [
+            solver
+            for solver in solvers
+            if "noise brackets" not in map(drives, solver.variables)
+        ]
     # Given noise, and paths whose law is not known, are not replaced by paths of a solver,
     # so only solvers that find their random variables in these are suitable.
     kept = [path for path in paths if not is_random(path) or has_unknown_law(path)]
@@ -407,11 +397,6 @@ def _suitable(
         for solver in solvers
         if all(_has_variables_for(path, solver) for path in kept)
     ]
-
-
-def _needs_areas(solver: AbstractSymplecticSolver) -> bool:
-    """Whether the solver needs the Lévy areas between noises."""
-    return "noise brackets" in map(drives, solver.variables)
 
 
 def _has_variables_for(
@@ -455,48 +440,37 @@ def accepts_friction(
     return True
 
 
-def ranked(
-    want: Want,
-    structures: Collection[Structure],
-    commute: bool,
-    num_noises: int,
-    friction: bool = False,
-    general_bath: bool = False,
-    friction_in_drift: bool = False,
-) -> list[AbstractSymplecticSolver]:
-    """The suggested solvers for systems of these structures (`"any"` is implied) and with
-    such noises, best first. The last three arguments are as in `_System`."""
-    structures = {"any", *structures}
+def ranked(want: Want, system: System) -> list[AbstractSymplecticSolver]:
+    """The suggested solvers for such a system, best first."""
+    structures = {"any", *system.structures}
     if {"separable", "constant"} <= structures:
         structures.add("separable and constant")
-    noises = ("any", "commuting" if commute else "not commuting")
+    noises = ("any", "commuting" if system.commute else "not commuting")
 
     def is_suitable(kind: type[AbstractSymplecticSolver]) -> bool:
         if kind in FOR_FRICTION:
-            return friction
+            return system.friction
         solver = kind()
-        return solver.structure in structures and _record(solver).noises in noises
+        assert solver.record is not None
+        return solver.structure in structures and solver.record.noises in noises
 
     kinds = list(filter(is_suitable, FOR_MEANS if want == "weak" else FOR_PATHS))
     if want == "weak":
-        if NinomiyaVictoir in kinds and num_noises > _MOST_FLOWS_OF_NOISE:
+        if NinomiyaVictoir in kinds and system.num_noises > _MOST_FLOWS_OF_NOISE:
             # It takes one flow for each noise, so it comes last.
             kinds.remove(NinomiyaVictoir)
             kinds.append(NinomiyaVictoir)
-        if friction or friction_in_drift:
+        if system.friction or system.friction_in_drift:
             # It comes before these: at every step size it has the exact stationary means of
             # harmonic modes.
             kinds.remove(SRKw1)
             kinds.insert(0, SRKw1)
-        if friction:
+        if system.friction:
             kinds = [*FOR_FRICTION, *kinds]
     best_first: list[AbstractSymplecticSolver] = [kind() for kind in kinds]
-    return [_BATH_OF_ANY_ENERGY, *best_first] if general_bath else best_first
-
-
-def _record(solver: AbstractSymplecticSolver) -> Record:
-    assert solver.record is not None
-    return solver.record
+    if system.general_bath:
+        best_first.insert(0, _BATH_OF_ANY_ENERGY)
+    return best_first
 
 
 def _code(solver: AbstractSymplecticSolver, module: str = "") -> str:
@@ -506,27 +480,6 @@ def _code(solver: AbstractSymplecticSolver, module: str = "") -> str:
     if isinstance(solver, BAOAB) and is_solver(solver.flow):
         flow = _code(solver.flow, module)  # pyright: ignore
     return f"{module}{type(solver).__name__}({flow})"
-
-
-def _suggestion(
-    solver: AbstractSymplecticSolver,
-    want: Want,
-    terms: diffrax.AbstractTerm,
-    commute: bool,
-    needs_bounded: bool,
-    terms_of_key: Callable,
-) -> Suggestion:
-    """The suggestion of this solver. `needs_bounded` is whether implicit steps need bounded
-    increments. `terms_of_key` is the field `terms` of the suggestion."""
-    record = _record(solver)
-    return Suggestion(
-        solver=solver,
-        weak_order=cast(int, record.order("weak", commute)),
-        strong_order=record.order("strong", commute),
-        path=_path_code(solver, want, terms, needs_bounded),
-        reason=record.reason,
-        terms=terms_of_key,
-    )
 
 
 def _path_code(

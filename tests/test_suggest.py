@@ -15,6 +15,7 @@ from diffrax_symplectic._suggest import (
     _shape_code,
     FOR_FRICTION,
     ranked,
+    System,
 )
 from diffrax_symplectic._terms import (
     brownian_paths,
@@ -163,7 +164,7 @@ def test_beside_other_noise_solvers_for_strong_friction_in_the_drift_come_first(
 
 
 def test_many_noises_that_do_not_commute_do_not_ask_for_a_flow_of_each():
-    first = lambda m: type(ranked("weak", ["any"], False, m)[0])
+    first = lambda m: type(ranked("weak", System((), False, m))[0])
     assert first(2) is first(4) is ds.NinomiyaVictoir
     assert first(6) is first(300) is ds.SRKw1
 
