@@ -201,12 +201,28 @@ def ensemble(
     num_times = problem.levels.saved_steps.size
     check_memory("num_paths", num_paths, num_times * problem.bytes_of_state)
     if batch_size is None:
-        batch_size = _default_batch_size(engine, problem)
+        entries_of_batch = _ENTRIES_OF_BATCH[engine]
+        if jax.default_backend() != "cpu":
+            entries_of_batch *= _FACTOR_ON_ACCELERATORS
+        batch_size = max(_FEWEST_PATHS, entries_of_batch // problem.num_components)
     batch_size = min(whole_number("batch_size", batch_size), num_paths)
-    batches = _simulated_batches(problem, key, engine, num_paths, batch_size)
+    batches = []
+    for first in range(0, num_paths, batch_size):
+        # JAX would compile anew for a last batch of another size.
+        num_left = num_paths - first
+        size = batch_size if engine == "jax" else min(batch_size, num_left)
+        sample_numbers = np.arange(first, first + size, dtype=np.uint64)
+        batches.append(ENGINES[engine](problem, key, sample_numbers))
     whole = _concatenated(batches, num_paths, at_end=ts is None)
-    advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
-    _warn_of_failures(whole, advice)
+    num_failed = int(np.sum(whole.failed))
+    if num_failed > 0:
+        advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
+        warnings.warn(
+            f"{num_failed:,} of {num_paths:,} paths failed. Their states are NaN: select "
+            f"the others with `~failed`. {advice}",
+            stacklevel=2,
+        )
+    warn_of_stragglers(whole.num_stragglers, num_failed, num_paths, stacklevel=2)
     # The times at which steps end. (Those in `ts` may differ from them by rounding.)
     saved_steps = np.asarray(problem.levels.saved_steps[0])
     saved_times = float(problem.t0) + saved_steps * float(problem.levels.h[0])
@@ -219,31 +235,6 @@ def ensemble(
         _problem=problem,
         _key=key,
     )
-
-
-def _default_batch_size(engine: str, problem: Problem) -> int:
-    """The number of paths in a batch if the user does not say it."""
-    entries_of_batch = _ENTRIES_OF_BATCH[engine]
-    if jax.default_backend() != "cpu":
-        entries_of_batch *= _FACTOR_ON_ACCELERATORS
-    entries_of_path = problem.num_components
-    return max(_FEWEST_PATHS, entries_of_batch // entries_of_path)
-
-
-def _simulated_batches(
-    problem: Problem, key: PRNGKeyArray, engine: str, num_paths: int, batch_size: int
-) -> list[Batch]:
-    """The batches that hold this number of paths, and for `"jax"` maybe surplus ones at the
-    end."""
-    simulate_batch = ENGINES[engine]
-    batches = []
-    for first in range(0, num_paths, batch_size):
-        # JAX would compile anew for a last batch of another size.
-        num_left = num_paths - first
-        size = batch_size if engine == "jax" else min(batch_size, num_left)
-        sample_numbers = np.arange(first, first + size, dtype=np.uint64)
-        batches.append(simulate_batch(problem, key, sample_numbers))
-    return batches
 
 
 def _concatenated(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
@@ -259,16 +250,3 @@ def _concatenated(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
 
     y = jtu.tree_map(concatenate, *[batch.y for batch in batches])
     return Batch(y, failed, sum(batch.num_stragglers for batch in batches))
-
-
-def _warn_of_failures(whole: Batch, advice: str) -> None:
-    """Warns of failed paths, with advice, and of many stragglers among all paths."""
-    num_paths = len(whole.failed)
-    num_failed = int(np.sum(whole.failed))
-    if num_failed > 0:
-        warnings.warn(
-            f"{num_failed:,} of {num_paths:,} paths failed. Their states are NaN: select "
-            f"the others with `~failed`. {advice}",
-            stacklevel=3,
-        )
-    warn_of_stragglers(whole.num_stragglers, num_failed, num_paths, stacklevel=3)

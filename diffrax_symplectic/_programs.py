@@ -94,7 +94,9 @@ def traced(fn: Callable, *inputs: PyTree, identity: Any = None) -> Traced:
     if isinstance(fn, Traced):
         return fn
     leaves, treedef = jtu.tree_flatten((fn, inputs))
-    is_array = [_is_array_or_struct(leaf) for leaf in leaves]
+    is_array = [
+        eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves
+    ]
     # Set by `results` while it is traced.
     static_results = None
 
@@ -126,10 +128,6 @@ def traced(fn: Callable, *inputs: PyTree, identity: Any = None) -> Traced:
     consts = map(jnp.asarray, closed_jaxpr.consts)
     numbers = [*consts, *text_numbers, *fn_arrays]
     return Traced(_interned(program, fn if identity is None else identity), numbers)
-
-
-def _is_array_or_struct(x: Any) -> bool:
-    return eqx.is_array(x) or isinstance(x, jax.ShapeDtypeStruct)
 
 
 class _Program:
@@ -184,7 +182,9 @@ def _numbers_apart(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:
         OperandPlace(k, position)
         for k, eqn in enumerate(jaxpr.eqns)
         for position, x in enumerate(eqn.invars)
-        if isinstance(x, Literal) and _is_data(eqn, position, x)
+        if isinstance(x, Literal)
+        and _has_many_digits(x)
+        and not (position == 1 and eqn.primitive.name in _KNOWN_SECOND)
     ]
     numbers = [jaxpr.eqns[place.operation].invars[place.position] for place in places]
     # A function may return a number of its text, such as a constant friction. In the text
@@ -228,14 +228,6 @@ def _product(dtype: Any) -> JaxprEqn:
     struct = jax.ShapeDtypeStruct((), dtype)
     [eqn] = jax.make_jaxpr(jax.lax.mul)(struct, struct).jaxpr.eqns
     return eqn
-
-
-def _is_data(eqn: JaxprEqn, position: int, number: Literal) -> bool:
-    """Whether a number, which an operation takes at this position, is data, rather than a
-    part of a formula."""
-    if position == 1 and eqn.primitive.name in _KNOWN_SECOND:
-        return False
-    return _has_many_digits(number)
 
 
 def _has_many_digits(number: Literal) -> bool:
@@ -441,27 +433,20 @@ def compiled(fn: Callable[..., Result], quickly: bool = False) -> Callable[..., 
             ]
             return fn(*treedef.unflatten(all_leaves))
 
-        def jitted() -> Callable:
-            return jax.jit(of_arrays, compiler_options=options)
-
+        jitted = ft.partial(jax.jit, of_arrays, compiler_options=options)
         key = fn, quickly, treedef, tuple(is_array), static_part(others)
         try:
             return _programs.get(key, jitted)(arrays)
         except ValueError as error:
-            if not _refuses_options(error):
+            # So JAX refuses options of the compiler for a program inside of another, or one
+            # that captures values of another. It has no class of errors for this.
+            if "`compiler_options`" not in str(error):
                 raise
-        # Inside of another program, the options of that one apply.
+        # There the options of the other program apply.
         without_options = compiled(fn)
         return without_options(*args)
 
     return call
-
-
-def _refuses_options(error: ValueError) -> bool:
-    """Whether JAX refuses options of the compiler, as it does for a program inside of
-    another, or one that captures values of another, before it calls the function. It has
-    no class of errors for this."""
-    return "`compiler_options`" in str(error)
 
 
 # The user's functions that are called while a trace is made, with their inputs.
