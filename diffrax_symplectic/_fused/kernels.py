@@ -17,7 +17,7 @@ from .._stablehlo import (
     array_in_memory,
     array_types,
     ArrayType,
-    drjit,
+    dr,
     elements_of_both,
     elements_where,
     entries_of,
@@ -156,7 +156,6 @@ class Kernels:
         """The paths with the numbers `first_path` to `first_path + num_paths - 1` before
         their first step, and what they share in steps of size `h`. If paths differ, `y0`
         and `own_args` have a leading axis of paths."""
-        dr = drjit()
         kinds = array_types()
         # The number of the first path is opaque: otherwise it would be a constant of the
         # kernel, so that every batch compiled a kernel of its own, in 20 to 40 ms.
@@ -187,7 +186,7 @@ class Kernels:
     ) -> Lanes:
         """The paths after the steps `first_step` to `end_step - 1`."""
         # Numbers of steps are opaque, so that other numbers need no other kernel.
-        opaque = ft.partial(drjit().opaque, array_types()["i32"])
+        opaque = ft.partial(dr.opaque, array_types()["i32"])
         y, solver_state, stopped = self._take_steps(
             *shared, opaque(first_step), opaque(end_step), *lanes
         )
@@ -209,7 +208,7 @@ class Kernels:
             ]
         entries = [entry for x in arrays for entry in as_numbers(x).flat]
         return [
-            drjit().opaque(array_types()[kind], entry.item(), num_paths)
+            dr.opaque(array_types()[kind], entry.item(), num_paths)
             for kind, entry in zip(kinds, entries, strict=True)
         ]
 
@@ -253,7 +252,6 @@ class Kernels:
         """The state, the solver state and which paths stopped after the steps `first_step`
         to `end_step - 1`, as Dr.Jit records the loop over steps. The arguments are the
         fields of `Shared`, the numbers of the steps, and the fields of `Lanes`."""
-        select = drjit().select
         # Dr.Jit numbers its variables one after another, one for each operation. So the
         # difference between this number and the last one below counts the operations.
         first_variable = variable_number(first_step + 1)
@@ -302,11 +300,13 @@ class Kernels:
             new_entries = [*entries_of(new_y), *entries_of(new_moving)]
             # A path that stopped stays where it was: sweeps over NaN would go on to the
             # limit in every later step.
-            kept = [select(stopped, old, new) for old, new in zip(entries, new_entries)]
+            kept = [
+                dr.select(stopped, old, new) for old, new in zip(entries, new_entries)
+            ]
             return i + 1, stopped, *kept
 
         state_at_start = (first_step, stopped, *y, *solver_state)
-        _, has_stopped, *entries = drjit().while_loop(
+        _, has_stopped, *entries = dr.while_loop(
             state_at_start, has_more_steps, after_step, mode="symbolic"
         )
         last_variable = max(map(variable_number, [has_stopped, *entries]))

@@ -35,7 +35,7 @@ their lanes by `Operation.fail`: JAX gets these paths. What has no rule is liste
 This folder knows nothing of differential equations.
 """
 
-from .backend import array_types, drjit
+from .backend import array_types, dr
 from .mlir import source_lines
 from .operation import NotReplayed
 from .replay import Replay

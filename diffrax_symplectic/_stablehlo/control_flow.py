@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeAlias
 
-from .backend import array_types, drjit
+from .backend import array_types, dr
 from .mlir import block_of, call_target, operations_in
 from .operation import Operation, rule
 from .tensor import (
@@ -90,7 +90,7 @@ def _conditional(
     Lanes that fail in their branch are marked."""
     # A symbolic conditional is a part of the kernel. Otherwise Dr.Jit may run a branch at
     # once.
-    results = drjit().if_stmt(
+    results = dr.if_stmt(
         args=(),
         cond=condition,
         true_fn=_returning_failures(operation, if_true),
@@ -143,7 +143,7 @@ _MOST_UNROLLED_OF_INDICES = 32
 def _while(operation: Operation, *xs: Tensor) -> list[Tensor]:
     is_changing = _which_change(operation)
     changing_entries = entries_of(elements_where(xs, is_changing))
-    has_only_indices = not any(map(drjit().is_float_v, changing_entries))
+    has_only_indices = not any(map(dr.is_float_v, changing_entries))
     max_unrolled = _MOST_UNROLLED_OF_INDICES if has_only_indices else _MOST_UNROLLED
     state = [*xs]
     # As long as the condition is known, the loop is unrolled. The iterations that are left
@@ -199,7 +199,7 @@ def _loop(
 
     # Where no lane can fail, Dr.Jit leaves the mask out.
     no_lane = array_types()["i1"](False)
-    results = drjit().while_loop(
+    results = dr.while_loop(
         state=(no_lane, *entries_of(variables)),
         cond=goes_on,
         body=iterate,

@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable
 from typing import Any, TypeAlias
 
-from .backend import array_types, drjit
+from .backend import array_types, dr
 from .mlir import call_target
 from .operation import NotReplayed, Operation, rule
 from .tensor import Tensor
@@ -38,7 +38,6 @@ def _lu(a: Matrix) -> tuple[Matrix, list[Any]]:
 def _number_of_pivot_row(rows: Matrix, column: int) -> Any:
     """The number of the row with the largest entry of a column, from the diagonal down. It
     differs between paths."""
-    dr = drjit()
     index = array_types()["i32"]
     largest = dr.abs(rows[column][column])
     pivot = index(column)
@@ -69,7 +68,7 @@ def _eliminate_below(rows: Matrix, column: int) -> None:
     entries in this column become zero, and stores the factors in place of these zeros."""
     top = rows[column]
     # If the pivot is zero, so is all that is below it.
-    inverse = drjit().select(top[column] == 0, 0, 1 / top[column])
+    inverse = dr.select(top[column] == 0, 0, 1 / top[column])
     for below in range(column + 1, len(rows)):
         row = rows[below]
         factor = row[column] * inverse
@@ -79,12 +78,12 @@ def _eliminate_below(rows: Matrix, column: int) -> None:
 
 def _where(mask: Any, row: list[Any], other: list[Any]) -> list[Any]:
     """One row where a mask is true, and another elsewhere."""
-    return [drjit().select(mask, x, y) for x, y in zip(row, other)]
+    return [dr.select(mask, x, y) for x, y in zip(row, other)]
 
 
 def _minus_multiple(row: list[Any], factor: Any, other: list[Any]) -> list[Any]:
     """`row - factor * other`."""
-    return [drjit().fma(-factor, y, x) for x, y in zip(row, other)]
+    return [dr.fma(-factor, y, x) for x, y in zip(row, other)]
 
 
 def _cholesky(a: Matrix) -> tuple[Matrix, Any]:
@@ -96,7 +95,6 @@ def _cholesky(a: Matrix) -> tuple[Matrix, Any]:
         l_jj = sqrt(a_jj - sum l_jk^2)
         l_ij = (a_ij - sum l_ik l_jk) / l_jj
     """
-    dr = drjit()
     rows = [[*row] for row in a]
     failed = array_types()["i1"](False)
     for j, row in enumerate(rows):
@@ -191,7 +189,7 @@ def _potrf(operation: Operation, x: Tensor) -> list[Tensor]:
         factor, failed = _cholesky(_transposed(matrix) if is_upper else matrix)
         factors.append(_transposed(factor) if is_upper else factor)
         # JAX only compares `info` with zero, so that any other number stands for failure.
-        info.append(drjit().select(failed, array_types()["i32"](1), 0))
+        info.append(dr.select(failed, array_types()["i32"](1), 0))
     _, shape_of_info = operation.shapes
     return [_tensor_of(factors, x.shape), Tensor(info, shape_of_info)]
 

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from .backend import array_types, drjit
+from .backend import array_types, dr
 from .complex import equal, is_complex
 from .integers import to_integer
 from .operation import NotReplayed, Operation, rule
-from .tensor import constant, entries_of, map_entries, Tensor
+from .tensor import constant, entries_of, is_same_table, map_entries, Tensor
 
 
 @rule
@@ -90,13 +90,22 @@ def _pad(operation: Operation, x: Tensor, value: Tensor) -> list[Tensor]:
 
 
 @rule
+def _select(
+    operation: Operation, mask: Tensor, if_true: Tensor, if_false: Tensor
+) -> list[Tensor]:
+    # `vmap` of a conditional selects between two equal tables: one stays in memory.
+    if is_same_table(if_true.entries, if_false.entries):
+        return [if_true]
+    return [map_entries(dr.select, mask, if_true, if_false)]
+
+
+@rule
 def _convert(operation: Operation, x: Tensor) -> list[Tensor]:
     return [map_entries(ft.partial(_converted, operation.dtype), x)]
 
 
 def _converted(dtype: type, entry: Any) -> Any:
     """An entry as a number of this type of Dr.Jit."""
-    dr = drjit()
     if type(entry) is dtype:
         return entry
     if dr.is_mask_v(dtype):
@@ -115,7 +124,7 @@ def _bitcast_convert(operation: Operation, x: Tensor) -> list[Tensor]:
         )
 
     def reinterpreted(entry: Any) -> Any:
-        return drjit().reinterpret_array(operation.dtype, entry)
+        return dr.reinterpret_array(operation.dtype, entry)
 
     return [map_entries(reinterpreted, x)]
 
@@ -152,8 +161,8 @@ def _in_total_order(a: Any) -> Any:
     The bits of positive numbers, read as an integer, are in their order, and those of
     negative numbers in the reverse order.
     """
-    num_bits = 8 * drjit().itemsize_v(a)
-    bits = drjit().reinterpret_array(array_types()[f"i{num_bits}"], a)
+    num_bits = 8 * dr.itemsize_v(a)
+    bits = dr.reinterpret_array(array_types()[f"i{num_bits}"], a)
     # The shift copies the bit of the sign to all bits: of a negative number all are set, of
     # others none. So the last line flips all bits of negative numbers but the sign, which
     # reverses their order.

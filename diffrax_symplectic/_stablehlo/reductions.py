@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .._compat import is_literal
-from .backend import drjit
+from .backend import dr
 from .complex import is_complex
 from .elementwise import is_zero
 from .operation import NotReplayed, ONLY_REGION, Operation, rule
@@ -22,12 +22,12 @@ _MOST_SORTED = 16
 
 
 def _is_real_float(a: Any) -> bool:
-    return drjit().is_float_v(a) and not is_complex(a)
+    return dr.is_float_v(a) and not is_complex(a)
 
 
 def _multiplied_and_added(a: Any, b: Any, c: Any) -> Any:
     """`a b + c`, in one operation if it can be."""
-    return drjit().fma(a, b, c) if _is_real_float(c) else a * b + c
+    return dr.fma(a, b, c) if _is_real_float(c) else a * b + c
 
 
 @rule
@@ -224,8 +224,7 @@ def _put_in_order(
     pairs = [scalar(entries[place]) for entries in arrays for place in (right, left)]
     (right_comes_first,) = operation.run(ONLY_REGION, pairs)
     is_wrong_order = right_comes_first.item()
-    select = drjit().select
     for entries in arrays:
-        new_left = select(is_wrong_order, entries[right], entries[left])
-        entries[right] = select(is_wrong_order, entries[left], entries[right])
+        new_left = dr.select(is_wrong_order, entries[right], entries[left])
+        entries[right] = dr.select(is_wrong_order, entries[left], entries[right])
         entries[left] = new_left

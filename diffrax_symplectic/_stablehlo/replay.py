@@ -7,9 +7,16 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from .._compat import stablehlo_module
+from . import (  # noqa: F401 (they fill `RULES`)
+    control_flow,
+    linear_algebra,
+    moves,
+    reductions,
+    windows,
+)
 from .mlir import block_of, callee_of, constant_values, functions_of, operations_in
-from .operation import NotReplayed, Operation
-from .operations import rule_of
+from .operation import NotReplayed, Operation, RULES
+from .operations import entry_by_entry
 from .tensor import array_in_memory, ArrayType, MOST_IN_REGISTERS, Table, Tensor
 
 
@@ -134,9 +141,7 @@ class Replay:
             return self._run_block(block_of(op, i), args, values, failures)
 
         operation = Operation(op, run, failures)
-        rule = rule_of(operation.name)
-        if rule is None:
-            raise NotReplayed(op)
+        rule = RULES.get(operation.name, entry_by_entry)
         try:
             return rule(operation, *operands)
         except (TypeError, RuntimeError) as error:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .._compat import is_literal
-from .backend import array_types, drjit
+from .backend import array_types, dr
 
 
 # Larger arrays that all paths share stay in memory: each entry in registers is a variable
@@ -61,7 +61,7 @@ class Table(Sequence):
 
     def gathered(self, addresses: Any) -> Any:
         """What is at these addresses in `memory`, one for each path."""
-        return drjit().gather(type(self.memory), self.memory, addresses)
+        return dr.gather(type(self.memory), self.memory, addresses)
 
 
 class Tensor(NamedTuple):
@@ -90,10 +90,8 @@ class Tensor(NamedTuple):
         return entry
 
 
-def same_table(a: Tensor, b: Tensor) -> bool:
+def is_same_table(one: Sequence[Any], other: Sequence[Any]) -> bool:
     """Whether both are the same part of the same array in memory."""
-    one = a.entries
-    other = b.entries
     if not (isinstance(one, Table) and isinstance(other, Table)):
         return False
     return one.memory is other.memory and np.array_equal(one.addresses, other.addresses)
@@ -135,7 +133,7 @@ def known_values(x: Tensor) -> np.ndarray | None:
 
 def _value(literal: Any) -> Any:
     """The number in a literal of Dr.Jit."""
-    if drjit().is_complex_v(literal):
+    if dr.is_complex_v(literal):
         return complex(literal.real[0], literal.imag[0])
     return literal[0]
 
@@ -184,7 +182,7 @@ def as_own_literal(entry: Any) -> Any:
     """An entry that a conditional or loop returned, for use after it. If both branches
     return the same constant, Dr.Jit returns the constant of the second branch, which is
     defined within it only: LLVM aborts the process if an outer branch returns that."""
-    if drjit().is_complex_v(entry):
+    if dr.is_complex_v(entry):
         # One part of a complex number may be a constant, and the other not.
         return type(entry)(as_own_literal(entry.real), as_own_literal(entry.imag))
     return type(entry)(entry[0]) if is_literal(entry) else entry

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from .backend import array_types, drjit
+from .backend import array_types, dr
 from .elementwise import elementwise
 from .operation import NotReplayed, ONLY_REGION, Operation, rule
 from .tensor import (
@@ -132,7 +132,7 @@ def _selected(mask: Any, new: Tensor, old: Tensor | None) -> Tensor:
     # entries with the first. In other lanes a later window replaces it.
     if old is None or mask is True:
         return new
-    return map_entries(ft.partial(drjit().select, mask), new, old)
+    return map_entries(ft.partial(dr.select, mask), new, old)
 
 
 def _window_at(
@@ -215,7 +215,7 @@ def _widened(index: Tensor) -> Tensor:
     array."""
 
     def widened_entry(entry: Any) -> Any:
-        is_narrow = drjit().itemsize_v(entry) < 4
+        is_narrow = dr.itemsize_v(entry) < 4
         return array_types()["i32"](entry) if is_narrow else entry
 
     return map_entries(widened_entry, index)

@@ -8,7 +8,7 @@ import pytest
 from diffrax_symplectic._stablehlo import (
     array_in_memory,
     array_types,
-    drjit,
+    dr,
     NotReplayed,
     Replay,
     scalar,
@@ -68,7 +68,7 @@ def test_a_replay_is_part_of_the_loop_that_it_stands_in():
 
     count = array_types()["i32"](0)
     start = array_in_memory("f64", X)
-    _, end = drjit().while_loop((count, start), lambda i, _: i < 5, once)
+    _, end = dr.while_loop((count, start), lambda i, _: i < 5, once)
     np.testing.assert_array_equal(end, 32 * X)
 
 
