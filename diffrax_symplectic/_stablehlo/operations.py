@@ -47,8 +47,9 @@ def entry_by_entry(operation: Operation, *xs: Tensor) -> list[Tensor]:
     function = of_complex if has_complex_operand else of_real
     angles = _ANGLES_OF_COMPLEX if has_complex_operand else _ANGLES_OF_REAL
     if function is None:
-        numbers = "complex numbers" if has_complex_operand else "real numbers"
-        raise NotReplayed(operation.mlir_op, f"`{operation.full_name}` of {numbers}")
+        raise operation.refusal(
+            f"of {'complex' if has_complex_operand else 'real'} numbers"
+        )
 
     def applied(*entries: Any) -> Any:
         if name in angles:
