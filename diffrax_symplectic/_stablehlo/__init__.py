@@ -40,12 +40,12 @@ from .mlir import source_lines
 from .operation import NotReplayed
 from .replay import Replay
 from .tensor import (
-    ArrayType,
-    elements_where,
-    entries_of,
     array_in_memory,
-    elements_of_both,
+    ArrayType,
+    entries_of,
     MOST_IN_REGISTERS,
     scalar,
+    Table,
+    Tensor,
+    tensors_from,
 )
-from .tensor import Table, Tensor, tensors_from

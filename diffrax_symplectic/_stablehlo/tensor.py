@@ -1,9 +1,10 @@
 """Arrays of one path as lists of Dr.Jit arrays, each with one entry for all paths."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,8 @@ from .backend import array_types, dr
 MOST_IN_REGISTERS = 64
 
 
-class ArrayType(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class ArrayType:
     """The shape of an array, and StableHLO's name of the type of its entries (`f64`)."""
 
     shape: tuple[int, ...]
@@ -64,7 +66,8 @@ class Table(Sequence):
         return dr.gather(type(self.memory), self.memory, addresses)
 
 
-class Tensor(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Tensor:
     """An array whose entries, in row-major order, are Dr.Jit arrays with one lane for each
     path."""
 
@@ -186,18 +189,3 @@ def as_own_literal(entry: Any) -> Any:
         # One part of a complex number may be a constant, and the other not.
         return type(entry)(as_own_literal(entry.real), as_own_literal(entry.imag))
     return type(entry)(entry[0]) if is_literal(entry) else entry
-
-
-def elements_where(xs: Sequence[Any], mask: Sequence[bool]) -> list[Any]:
-    """The elements of `xs` where the mask is true."""
-    return [x for x, is_true in zip(xs, mask, strict=True) if is_true]
-
-
-def elements_of_both(
-    mask: Sequence[bool], where_true: Iterable[Any], where_false: Iterable[Any]
-) -> list[Any]:
-    """One list of two, as long as the mask: the next element of `where_true` where the mask
-    is true, and of `where_false` elsewhere. `elements_where` takes them apart again."""
-    true_elements = iter(where_true)
-    false_elements = iter(where_false)
-    return [next(true_elements if is_true else false_elements) for is_true in mask]
