@@ -326,7 +326,7 @@ def test_large_states_are_refused():
 @pytest.fixture
 def fresh():
     """What is known of Dr.Jit is asked for again, within the test and after it."""
-    caches = backend.drjit, backend.array_types
+    caches = backend._drjit, backend.array_types
     for fn in caches:
         fn.cache_clear()
     yield
@@ -346,7 +346,7 @@ def test_without_drjit_an_error_says_how_to_install_it(monkeypatch, fresh):
 @needs_drjit
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="a GPU needs no LLVM")
 def test_without_llvm_an_error_says_how_to_install_it(monkeypatch, fresh):
-    monkeypatch.setattr(backend.drjit(), "has_backend", lambda backend: False)
+    monkeypatch.setattr(backend._drjit(), "has_backend", lambda backend: False)
     with pytest.raises(ImportError, match="libllvm19.*DRJIT_LIBLLVM_PATH"):
         follow(engine="drjit")
 

@@ -17,6 +17,6 @@ Kernels depend on `functions` alone, so that the same serve for all values of `a
 sizes, and numbers of steps and paths.
 """
 
-from .kernels import Kernels, Lanes, Shared
+from .kernels import Kernels, Lanes
 from .path_functions import PathFunctions, sample_key, functions_and_arrays
 from .sweeps import by_sweeps_alone

@@ -1,7 +1,7 @@
 """The functions of one path that kernels are made of, apart from the values they read."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -12,36 +12,7 @@ import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .._compat import is_threefry
-from .._custom_types import Args, Y
 from .._terms import path_keys, with_keys
-
-
-@runtime_checkable
-class SteppedSystem(Protocol):
-    """What a kernel needs of a system: a PyTree whose leaves are all that it reads.
-
-    - `terms`: the terms, with random keys for which each path substitutes its own.
-    - `y0`, `args`: the initial state and `args` of all paths, or examples if paths differ.
-    """
-
-    terms: PyTree
-    y0: Y
-    args: Args
-
-    def with_args(self, own_args: PyTree[Array]) -> "SteppedSystem":
-        """The system with these arrays in its `args`."""
-        ...
-
-    def init(self, terms: PyTree, i: Any, h: Any, y: Y) -> PyTree[Array]:
-        """The state of the solver before step `i` of size `h`."""
-        ...
-
-    def step(
-        self, terms: PyTree, i: Any, h: Any, y: Y, state: PyTree[Array]
-    ) -> tuple[Y, PyTree[Array], Bool[Array, ""]]:
-        """The states of the path and of the solver after step `i`, and whether it
-        succeeded."""
-        ...
 
 
 class Stepped(NamedTuple):
@@ -61,22 +32,28 @@ class PathFunctions(NamedTuple):
     """A system without the values of its arrays, as functions of these values. Hashable: it
     is what a kernel is compiled for.
 
+    A system is a PyTree whose leaves are all that a kernel reads, with the fields `terms`,
+    `y0` and `args` and the methods `with_args`, `init` and `step` of
+    `_simulation.Problem`. For the random keys in `terms` each path substitutes its own.
+
     In these functions `arrays` are the arrays of the system. Each path has `keys` of its
     own, the words of the random keys in its terms; and if its `args` are drawn, `own_args`,
     the arrays in them, of which there are none otherwise.
 
-    - `treedef`, `static`, `structs`: the structure of the system, and two entries for each
-        of its leaves. For an array, `static` has `None` and `structs` its shape and type;
-        for any other leaf, `static` has the leaf and `structs` has `None`.
+    - `arrays`, `arrays_treedef`: the shapes and types of the arrays of the system, and its
+        structure with `None` for all other leaves.
+    - `static`, `static_treedef`: the other leaves, such as the user's functions, which are
+        part of what is compiled, and the structure with `None` for arrays.
     - `impl`: the implementation of random keys.
     - `own_args`: the shapes of the arrays of `args` that each path has of its own.
     - `paths_differ`: whether each path has its own initial state and `args`.
     - `settings`: settings of JAX that programs depend on.
     """
 
-    treedef: Any
+    arrays: tuple[jax.ShapeDtypeStruct, ...]
+    arrays_treedef: Any
     static: tuple[Any, ...]
-    structs: tuple[jax.ShapeDtypeStruct | None, ...]
+    static_treedef: Any
     impl: str
     own_args: tuple[jax.ShapeDtypeStruct, ...]
     paths_differ: bool
@@ -86,57 +63,49 @@ class PathFunctions(NamedTuple):
     # field above or an argument, so that equal `PathFunctions` have equal programs.
 
     @property
-    def arrays(self) -> list[jax.ShapeDtypeStruct]:
-        """The shapes and types of the arrays of the system."""
-        return [struct for struct in self.structs if struct is not None]
-
-    @property
     def key(self) -> Any:
         """The shape and type of a random key."""
         return jax.eval_shape(lambda: jr.key(0, impl=self.impl))
 
-    def system(self, arrays: Sequence[Any]) -> SteppedSystem:
+    def system(self, arrays: Sequence[Any]) -> PyTree:
         """The system with these arrays."""
-        remaining_arrays = iter(arrays)
-        # What is no array, such as the user's functions, is part of what is compiled.
-        leaves = [
-            value if struct is None else next(remaining_arrays)
-            for value, struct in zip(self.static, self.structs)
-        ]
-        return self.treedef.unflatten(leaves)
+        return eqx.combine(
+            self.arrays_treedef.unflatten(arrays),
+            self.static_treedef.unflatten(self.static),
+        )
 
-    def y0(self, arrays: list[Array]) -> list[Array]:
+    def y0(self, arrays: Sequence[Any]) -> list[Array]:
         """The leaves of the initial state of all paths."""
         return jtu.tree_leaves(self.system(arrays).y0)
 
-    def path_keys(self, arrays: list[Array], key, high, low) -> list[Array]:
+    def path_keys(self, arrays: Sequence[Any], key, high, low) -> list[Array]:
         """The random keys in the terms of path number `high * 2^32 + low`."""
         return path_keys(self.system(arrays).terms, sample_key(key, high, low))
 
     def start(
         self,
-        arrays: list[Array],
+        arrays: Sequence[Any],
         keys: list[Array],
-        own_args: list[Array],
-        y_leaves: list[Array],
+        own_args: Sequence[Any],
+        y: list[Array],
     ) -> list:
         """The leaves of the state of the solver before the first step of a path, from those
         of its initial state."""
         system, terms = self._system_and_terms(arrays, keys, own_args)
-        y = jtu.tree_unflatten(jtu.tree_structure(system.y0), y_leaves)
+        y0 = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
         # Any size of the first step will do: no solver's initial state depends on it.
-        h = jnp.ones((), jnp.result_type(*y_leaves))
-        return jtu.tree_leaves(system.init(terms, 0, h, y))
+        h = jnp.ones((), jnp.result_type(*y))
+        return jtu.tree_leaves(system.init(terms, 0, h, y0))
 
     def step(
         self,
-        arrays: list[Array],
+        arrays: Sequence[Any],
         keys: list[Array],
-        own_args: list[Array],
+        own_args: Sequence[Any],
         h: Array,
         i: Array,
-        y_leaves: list[Array],
-        solver_leaves: list[Array],
+        y: list[Array],
+        solver_state: list[Array],
     ) -> Stepped:
         """A path after step number `i` of size `h`, from the leaves of its state and of the
         solver's state."""
@@ -144,14 +113,14 @@ class PathFunctions(NamedTuple):
         # `init` is traced and not run: only the structure of the solver's state is needed.
         solver_struct = eqx.filter_eval_shape(system.init, terms, 0, h, system.y0)
         solver_treedef = jtu.tree_structure(solver_struct)
-        y0 = jtu.tree_unflatten(jtu.tree_structure(system.y0), y_leaves)
-        state0 = jtu.tree_unflatten(solver_treedef, solver_leaves)
+        y0 = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
+        state0 = jtu.tree_unflatten(solver_treedef, solver_state)
         y1, state1, success = system.step(terms, i, h, y0, state0)
         return Stepped(jtu.tree_leaves(y1), jtu.tree_leaves(state1), success)
 
     def _system_and_terms(
-        self, arrays: list[Array], keys: list[Array], own_args: list[Array]
-    ) -> tuple[SteppedSystem, PyTree]:
+        self, arrays: Sequence[Any], keys: list[Array], own_args: Sequence[Any]
+    ) -> tuple[PyTree, PyTree]:
         """The system with the `args` of a path, and its terms with the keys of the path.
         (The terms within the system keep the keys of the system.)"""
         system = self.system(arrays)
@@ -168,7 +137,7 @@ def sample_key(key: PRNGKeyArray, high, low) -> PRNGKeyArray:
 
 
 def functions_and_arrays(
-    system: SteppedSystem,
+    system: PyTree,
     key: PRNGKeyArray,
     own_args: PyTree[Array],
     paths_differ: bool,
@@ -179,26 +148,7 @@ def functions_and_arrays(
     `own_args` is an example of the arrays in `args` that each path has of its own, and
     `paths_differ` says whether each has its own initial state and `args`.
     """
-    leaves, treedef = jtu.tree_flatten(system)
-    _check_keys([key, *leaves])
-    # Arrays of NumPy are inputs, too: another parameter must not need another kernel.
-    arrays_or_none = [jnp.asarray(x) if _is_array(x) else None for x in leaves]
-    functions = PathFunctions(
-        treedef=treedef,
-        static=tuple(None if _is_array(x) else x for x in leaves),
-        structs=tuple(None if x is None else _struct(x) for x in arrays_or_none),
-        impl=str(jr.key_impl(key)),
-        own_args=tuple(map(_struct, jtu.tree_leaves(own_args))),
-        paths_differ=paths_differ,
-        # The type of Python's floats says whether JAX has 64 bits.
-        settings=(jax.default_backend(), jnp.result_type(float)),
-    )
-    return functions, [x for x in arrays_or_none if x is not None]
-
-
-def _check_keys(leaves: Sequence[Any]) -> None:
-    """Raises a `ValueError` for random keys of a generator that kernels do not have."""
-    for x in leaves:
+    for x in [key, *jtu.tree_leaves(system)]:
         if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
             if not is_threefry(x):
                 raise ValueError(
@@ -206,6 +156,22 @@ def _check_keys(leaves: Sequence[Any]) -> None:
                     f"threefry2x32; got a key of `{jr.key_impl(x)}`. Pass "
                     '`jax.random.key(seed)`, or `engine="jax"`.'
                 )
+    # Arrays of NumPy are inputs, too: another parameter must not need another kernel.
+    arrays, static = eqx.partition(system, _is_array)
+    array_leaves, arrays_treedef = jtu.tree_flatten(jtu.tree_map(jnp.asarray, arrays))
+    static_leaves, static_treedef = jtu.tree_flatten(static)
+    functions = PathFunctions(
+        arrays=tuple(map(_struct, array_leaves)),
+        arrays_treedef=arrays_treedef,
+        static=tuple(static_leaves),
+        static_treedef=static_treedef,
+        impl=str(jr.key_impl(key)),
+        own_args=tuple(map(_struct, jtu.tree_leaves(own_args))),
+        paths_differ=paths_differ,
+        # The type of Python's floats says whether JAX has 64 bits.
+        settings=(jax.default_backend(), jnp.result_type(float)),
+    )
+    return functions, array_leaves
 
 
 def _is_array(x: Any) -> bool:

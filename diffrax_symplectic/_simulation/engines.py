@@ -7,7 +7,7 @@ import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import equinox as eqx
 import jax
@@ -24,7 +24,6 @@ from .._fused import (
     Lanes,
     PathFunctions,
     sample_key,
-    Shared,
 )
 from .._lapack import lapack_in_turn
 from .._programs import compiled
@@ -192,7 +191,7 @@ class FusedStart(NamedTuple):
 
     kernels: Kernels
     lanes: Lanes
-    shared: Shared
+    shared: dict[str, Any]
 
 
 def fused_start(

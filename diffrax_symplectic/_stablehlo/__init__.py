@@ -35,17 +35,17 @@ their lanes by `Operation.fail`: JAX gets these paths. What has no rule is liste
 This folder knows nothing of differential equations.
 """
 
-from .backend import array_types, drjit
+from .backend import array_types, dr
 from .mlir import source_lines
 from .operation import NotReplayed
 from .replay import Replay
 from .tensor import (
-    ArrayType,
-    elements_where,
-    entries_of,
     array_in_memory,
-    elements_of_both,
+    ArrayType,
+    entries_of,
     MOST_IN_REGISTERS,
     scalar,
+    Table,
+    Tensor,
+    tensors_from,
 )
-from .tensor import Table, Tensor, tensors_from

@@ -23,11 +23,8 @@ _NO_CUDA = (
 )
 
 
-# Both are asked for at every operation that is recorded.
-
-
 @ft.cache
-def drjit() -> Any:
+def _drjit() -> Any:
     """The module. Raises an `ImportError` that says how to install it."""
     try:
         return importlib.import_module("drjit")
@@ -35,11 +32,20 @@ def drjit() -> Any:
         raise ImportError(_NO_DRJIT) from error
 
 
+class _DrJit:
+    """Stands for the module, which is imported when something in it is first asked for."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(_drjit(), name)
+
+
+dr: Any = _DrJit()
+
+
 @ft.cache
 def array_types() -> dict[str, Any]:
     """The types of arrays for JAX's default device, by StableHLO's names of the types of
     their entries. Raises an `ImportError` if Dr.Jit cannot compile for it."""
-    dr = drjit()
     on_cpu = jax.default_backend() == "cpu"
     # Importing `drjit.llvm` succeeds without LLVM, and the first kernel then fails.
     needed = dr.JitBackend.LLVM if on_cpu else dr.JitBackend.CUDA

@@ -1,25 +1,20 @@
 """Operations with regions: conditionals and loops."""
 
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, TypeAlias
+from collections.abc import Callable, Iterable
+from typing import Any
 
-from .backend import array_types, drjit
+from .backend import array_types, dr
 from .mlir import block_of, call_target, operations_in
 from .operation import Operation, rule
 from .tensor import (
     as_own_literal,
     copied_entries,
-    elements_of_both,
-    elements_where,
     entries_of,
     known_values,
     Tensor,
     tensors_from,
 )
 
-
-# Runs a branch of a conditional and returns the entries of its results.
-_RunBranch: TypeAlias = Callable[[], tuple[Any, ...]]
 
 # The numbers of the regions of a conditional, and of a loop.
 _IF_TRUE = 0
@@ -54,64 +49,13 @@ def _case(operation: Operation, index: Tensor) -> list[Tensor]:
         return operation.run(int(value) if 0 <= value <= last else last, [])
     # A kernel cannot raise an error. Lanes whose branch would raise one are marked as
     # failed, and take the last of the other branches.
-    replayed_branches = []
+    branches = {}
     for i, region in enumerate(regions):
         if _raises(region):
             operation.fail(index.item() == i)
         else:
-            replayed_branches.append(i)
-    results = _results_of_branch(operation, index.item(), replayed_branches)
-    return tensors_from(results, operation.shapes)
-
-
-def _results_of_branch(
-    operation: Operation, index: Any, branches: Sequence[int]
-) -> tuple[Any, ...]:
-    """The entries that a branch of a `case` returns: the one of number `index`, which each
-    lane has of its own, or the last of `branches` if these do not contain the number.
-    There must be at least one branch."""
-    first, *others = branches
-
-    def run_first() -> tuple[Any, ...]:
-        return copied_entries(operation.run(first, []))
-
-    def run_one_of_others() -> tuple[Any, ...]:
-        return _results_of_branch(operation, index, others)
-
-    if not others:
-        return run_first()
-    return _conditional(operation, index == first, run_first, run_one_of_others)
-
-
-def _conditional(
-    operation: Operation, condition: Any, if_true: _RunBranch, if_false: _RunBranch
-) -> tuple[Any, ...]:
-    """The entries that one of two branches returns, for each lane by its own condition.
-    Lanes that fail in their branch are marked."""
-    # A symbolic conditional is a part of the kernel. Otherwise Dr.Jit may run a branch at
-    # once.
-    results = drjit().if_stmt(
-        args=(),
-        cond=condition,
-        true_fn=_returning_failures(operation, if_true),
-        false_fn=_returning_failures(operation, if_false),
-        mode="symbolic",
-    )
-    # A constant of the inside would abort the process if it were used outside, so constants
-    # are made anew.
-    *entries, failed = map(as_own_literal, results)
-    operation.fail(failed)
-    return tuple(entries)
-
-
-def _returning_failures(operation: Operation, branch: _RunBranch) -> _RunBranch:
-    """A branch that also returns the mask of the lanes that fail in it, as the last."""
-
-    def run() -> tuple[Any, ...]:
-        entries, failed = operation.with_failures(branch)
-        return *entries, failed
-
-    return run
+            branches[i] = index.item() == i
+    return tensors_from(_results_of_branch(operation, branches), operation.shapes)
 
 
 @rule
@@ -119,17 +63,49 @@ def _if(operation: Operation, condition: Tensor) -> list[Tensor]:
     value = known_values(condition)
     if value is not None:
         return operation.run(_IF_TRUE if value else _IF_FALSE, [])
-
-    def if_true() -> tuple[Any, ...]:
-        return copied_entries(operation.run(_IF_TRUE, []))
-
-    def if_false() -> tuple[Any, ...]:
-        return copied_entries(operation.run(_IF_FALSE, []))
-
     # With `select` in its place both branches run: the midpoint rule, whose sweeps have
     # such branches, took 21 ns a step in place of 13.
-    results = _conditional(operation, condition.item(), if_true, if_false)
-    return tensors_from(results, operation.shapes)
+    branches = {_IF_TRUE: condition.item(), _IF_FALSE: ~condition.item()}
+    return tensors_from(_results_of_branch(operation, branches), operation.shapes)
+
+
+def _results_of_branch(
+    operation: Operation, branches: dict[int, Any]
+) -> tuple[Any, ...]:
+    """The entries that a branch returns: for each lane the first whose mask is true, or
+    the last. `branches` has their masks, by the numbers of their regions. Lanes that fail
+    in their branch are marked."""
+    (first, is_first), *others = branches.items()
+
+    def run_first() -> tuple[Any, ...]:
+        return copied_entries(operation.run(first, []))
+
+    def run_one_of_others() -> tuple[Any, ...]:
+        return _results_of_branch(operation, dict(others))
+
+    def with_failures(branch: Callable[[], tuple[Any, ...]]) -> Callable:
+        def run() -> tuple[Any, ...]:
+            entries, failed = operation.with_failures(branch)
+            return *entries, failed
+
+        return run
+
+    if not others:
+        return run_first()
+    # A symbolic conditional is a part of the kernel. Otherwise Dr.Jit may run a branch at
+    # once.
+    results = dr.if_stmt(
+        args=(),
+        cond=is_first,
+        true_fn=with_failures(run_first),
+        false_fn=with_failures(run_one_of_others),
+        mode="symbolic",
+    )
+    # A constant of the inside would abort the process if it were used outside, so constants
+    # are made anew.
+    *entries, failed = map(as_own_literal, results)
+    operation.fail(failed)
+    return tuple(entries)
 
 
 # The most iterations to unroll, of a loop whose condition is known.
@@ -141,9 +117,13 @@ _MOST_UNROLLED_OF_INDICES = 32
 
 @rule
 def _while(operation: Operation, *xs: Tensor) -> list[Tensor]:
-    is_changing = _which_change(operation)
-    changing_entries = entries_of(elements_where(xs, is_changing))
-    has_only_indices = not any(map(drjit().is_float_v, changing_entries))
+    body = block_of(operation.mlir_op, _BODY)
+    # The last operation returns the new state.
+    *_, last = body.operations
+    is_changing = [new != old for new, old in zip(last.operands, body.arguments)]
+    changing = [k for k, is_new in enumerate(is_changing) if is_new]
+    changing_entries = entries_of([xs[k] for k in changing])
+    has_only_indices = not any(map(dr.is_float_v, changing_entries))
     max_unrolled = _MOST_UNROLLED_OF_INDICES if has_only_indices else _MOST_UNROLLED
     state = [*xs]
     # As long as the condition is known, the loop is unrolled. The iterations that are left
@@ -156,29 +136,23 @@ def _while(operation: Operation, *xs: Tensor) -> list[Tensor]:
         if not goes_on:
             return state
         state = operation.run(_BODY, state)
-    return _loop(operation, state, is_changing)
-
-
-def _which_change(operation: Operation) -> list[bool]:
-    """For each value of a loop's state, whether the loop's body changes it."""
-    body = block_of(operation.mlir_op, _BODY)
-    # The last operation returns the new state.
-    *_, last = body.operations
-    return [new != old for new, old in zip(last.operands, body.arguments)]
+    return _loop(operation, state, changing)
 
 
 def _loop(
-    operation: Operation, state: list[Tensor], is_changing: Sequence[bool]
+    operation: Operation, start: list[Tensor], changing: list[int]
 ) -> list[Tensor]:
-    """The state at the end of a loop of the kernel, which starts from `state`.
-    `is_changing` says which values of the state the loop's body changes."""
+    """The state at the end of a loop of the kernel, which starts from `start`. The values
+    of the state that its body changes have the numbers `changing`."""
     # Values that do not change stay out of the loop's state, so that constants stay known.
-    variables = elements_where(state, is_changing)
-    constants = elements_where(state, [not changes for changes in is_changing])
-    shapes = [x.shape for x in variables]
+    variables = [start[k] for k in changing]
 
     def whole_state(entries: Iterable[Any]) -> list[Tensor]:
-        return elements_of_both(is_changing, tensors_from(entries, shapes), constants)
+        state = [*start]
+        new = tensors_from(entries, [x.shape for x in variables])
+        for k, x in zip(changing, new):
+            state[k] = x
+        return state
 
     # The mask of the lanes that failed so far is part of the state of Dr.Jit's loop, which
     # returns nothing else.
@@ -190,16 +164,14 @@ def _loop(
         return condition.item() & ~(failed | fails_now)
 
     def iterate(failed: Any, *entries: Any) -> tuple[Any, ...]:
-        new_state, fails_now = operation.with_failures(
+        state, fails_now = operation.with_failures(
             lambda: operation.run(_BODY, whole_state(entries))
         )
-        return failed | fails_now, *copied_entries(
-            elements_where(new_state, is_changing)
-        )
+        return failed | fails_now, *copied_entries([state[k] for k in changing])
 
     # Where no lane can fail, Dr.Jit leaves the mask out.
     no_lane = array_types()["i1"](False)
-    results = drjit().while_loop(
+    results = dr.while_loop(
         state=(no_lane, *entries_of(variables)),
         cond=goes_on,
         body=iterate,

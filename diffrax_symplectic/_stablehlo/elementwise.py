@@ -10,9 +10,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.polynomial.chebyshev import cheb2poly
 
 from .._compat import is_literal
-from .backend import drjit
+from .backend import dr
 from .integers import arithmetic_shift, logical_shift, safe_divisor, shift_left
 
 
@@ -33,7 +34,7 @@ _ERFC_END = 30.0
 
 
 def _add(a, b):
-    return a | b if drjit().is_mask_v(a) else a + b
+    return a | b if dr.is_mask_v(a) else a + b
 
 
 def is_zero(a: Any) -> bool:
@@ -43,7 +44,6 @@ def is_zero(a: Any) -> bool:
 
 
 def _multiply(a, b):
-    dr = drjit()
     if dr.is_mask_v(a):
         return a & b
     if dr.is_float_v(a):
@@ -69,21 +69,16 @@ def _times_zero(a, zero):
 
 
 def _maximum(a, b):
-    if drjit().is_mask_v(a):
+    if dr.is_mask_v(a):
         return a | b
     # NaN propagates, as in JAX.
-    return drjit().select((a > b) | _is_nan(a), a, b)
+    return dr.select((a > b) | dr.isnan(a), a, b)
 
 
 def _minimum(a, b):
-    if drjit().is_mask_v(a):
+    if dr.is_mask_v(a):
         return a & b
-    return drjit().select((a < b) | _is_nan(a), a, b)
-
-
-def _is_nan(a):
-    # In Dr.Jit, both `NaN == NaN` and `NaN != NaN` are false.
-    return ~(a == a)
+    return dr.select((a < b) | dr.isnan(a), a, b)
 
 
 def _clamp(low, a, high):
@@ -91,26 +86,22 @@ def _clamp(low, a, high):
 
 
 def _divide(a, b):
-    if drjit().is_float_v(a):
+    if dr.is_float_v(a):
         return a / b
-    safe, is_zero_divisor, _ = safe_divisor(a, b)
     # Dr.Jit's `//` of integers rounds to zero, as StableHLO does. By zero, the quotient has
     # all bits set, as in XLA.
-    return drjit().select(is_zero_divisor, ~type(a)(0), a // safe)
+    return dr.select(b == 0, ~type(a)(0), a // safe_divisor(a, b))
 
 
 def _remainder(a, b):
     """`a - trunc(a / b) b`, which has the sign of `a`."""
-    if drjit().is_float_v(a):
+    if dr.is_float_v(a):
         return _remainder_of_floats(a, b)
-    dr = drjit()
-    safe, is_zero_divisor, is_minus_one = safe_divisor(a, b)
-    rest = a - (a // safe) * safe
-    return dr.select(is_zero_divisor, a, dr.select(is_minus_one, type(a)(0), rest))
+    safe = safe_divisor(a, b)
+    return dr.select(b == 0, a, a - (a // safe) * safe)
 
 
 def _remainder_of_floats(a, b):
-    dr = drjit()
     size = dr.abs(a)
     divisor = dr.abs(b)
     nearly_rest = dr.fma(-dr.trunc(size / divisor), divisor, size)
@@ -127,10 +118,9 @@ def _remainder_of_floats(a, b):
 
 
 def _sign(a):
-    dr = drjit()
     if dr.is_float_v(a):
         # Zero keeps its sign, and NaN is itself.
-        return dr.select((a == 0) | _is_nan(a), a, dr.copysign(type(a)(1), a))
+        return dr.select((a == 0) | dr.isnan(a), a, dr.copysign(type(a)(1), a))
     return dr.select(a == 0, 0, dr.select(a > 0, type(a)(1), type(a)(-1)))
 
 
@@ -140,13 +130,13 @@ def _power(base, exponent):
     if is_literal(exponent):
         value = exponent[0]
         if float(value).is_integer() and abs(value) <= _MOST_MULTIPLIED:
-            return _whole_power(base, int(value))
+            power = dr.power(base, abs(int(value)))
+            return 1 / power if value < 0 else power
     return _power_by_logarithm(base, exponent)
 
 
 def _power_by_logarithm(base, exponent):
     """The power for any exponent. The last of the cases below that applies prevails."""
-    dr = drjit()
     dtype = type(base)
     power_of_size = dr.exp(dr.log(dr.abs(base)) * exponent)
     # A negative number has real powers for whole exponents only, negative for odd ones.
@@ -163,25 +153,9 @@ def _power_by_logarithm(base, exponent):
     return dr.select((exponent == 0) | (base == 1), dtype(1), power)
 
 
-def _whole_power(base, exponent: int):
-    """The power for an exponent that is known, by repeated squares."""
-    power = type(base)(1)
-    # The power is the product of `base**(2**k)` over the bits `k` that the exponent has,
-    # here from the last bit on.
-    square = base
-    bits = abs(exponent)
-    while bits:
-        is_last_bit_set = bits & 1
-        power = power * square if is_last_bit_set else power
-        square = square * square
-        bits = bits >> 1
-    return 1 / power if exponent < 0 else power
-
-
 def _expm1(a):
     """Kahan's formula `(e - 1) a / log(e)` with `e = exp(a)`, in which the rounding error
     of the exponential cancels."""
-    dr = drjit()
     exp = dr.exp(a)
     near_zero = (exp - 1) * a / dr.log(exp)
     # The formula is 0 / 0 where the exponential is rounded to one, and NaN of infinity.
@@ -191,7 +165,6 @@ def _expm1(a):
 def _log1p(a):
     """Kahan's formula `log(s) a / (s - 1)` with `s = 1 + a`, in which the rounding error of
     the sum cancels."""
-    dr = drjit()
     total = 1 + a
     log = dr.log(total)
     near_zero = log * a / (total - 1)
@@ -201,7 +174,7 @@ def _log1p(a):
 def _tan(a):
     # Dr.Jit's own in double precision is off by up to 5e-9 of the value, for angles between
     # 4e-8 and 1e-4. The quotient is right to three units in the last place.
-    sine, cosine = drjit().sincos(a)
+    sine, cosine = dr.sincos(a)
     return sine / cosine
 
 
@@ -212,7 +185,6 @@ def _atan(a):
 def _atan2(y, x):
     """By the arcsine of an angle of at most 45 degrees. Dr.Jit's own takes a maximum that
     LLVM 15 and 16 cannot compile: they abort the process."""
-    dr = drjit()
     dtype = type(y)
     steep = dr.abs(y) > dr.abs(x)
     shorter = dr.select(steep, dr.abs(x), dr.abs(y))
@@ -227,49 +199,35 @@ def _atan2(y, x):
     # The sign of `x` counts, also where it is zero: the angle of (0, -0) is pi.
     is_left = dr.copysign(dtype(1), x) < 0
     in_half = dr.select(is_left, np.pi - in_quarter_or_zero, in_quarter_or_zero)
-    return dr.select(_is_nan(y) | _is_nan(x), y + x, dr.copysign(in_half, y))
+    return dr.select(dr.isnan(y) | dr.isnan(x), y + x, dr.copysign(in_half, y))
 
 
 def _erf(a):
-    return drjit().select(_is_nan(a), a, drjit().erf(a))
+    return dr.select(dr.isnan(a), a, dr.erf(a))
 
 
 def _erfc(a):
     r"""In the tail `1 - erf(a)` has no digits left. So for $x = |a|$ it is computed as
-    $e^{-x^2} g(x) / (1 + 2 x)$, where `_erfc_series` has a polynomial for $g$."""
-    dr = drjit()
+    $e^{-x^2} g(x) / (1 + 2 x)$, with a polynomial for $g$."""
     dtype = type(a)
     # The size is bounded, since the next quotient would be NaN for infinity.
     size = _minimum(dr.abs(a), dtype(_ERFC_END))
     variable = (size - _ERFC_MIDDLE) / (size + _ERFC_MIDDLE)
-    series = _erfc_series(_ERFC_DEGREES[dr.itemsize_v(a)])
-    g = _chebyshev_sum(series, variable)
+    g = dtype(0)
+    for coefficient in reversed(_erfc_coefficients(_ERFC_DEGREES[dr.itemsize_v(a)])):
+        g = dr.fma(g, variable, coefficient)
     # With the square rounded, `size^2 = square + rounded_off`, where the last number is
     # small, so `exp(-size^2) = exp(-square) (1 - rounded_off)`. Near a size of 26 it is
     # half a unit in the last place of 676, or 256 of one.
     square = size * size
     rounded_off = dr.fma(size, size, -square)
     tail = dr.exp(-square) * (1 - rounded_off) * g / (1 + 2 * size)
-    return dr.select(_is_nan(a), a, dr.select(a < 0, 2 - tail, tail))
-
-
-def _chebyshev_sum(series: list[float], x):
-    """The sum of Chebyshev polynomials with these coefficients at `x`, by Clenshaw's
-    recurrence `b_k = c_k + 2 x b_(k+1) - b_(k+2)`: the sum is `c_0 + x b_1 - b_2`."""
-    dr = drjit()
-    first, *others = series
-    current = type(x)(0)
-    previous = type(x)(0)
-    for coefficient in reversed(others):
-        following = dr.fma(2 * x, current, coefficient - previous)
-        previous = current
-        current = following
-    return dr.fma(x, current, first - previous)
+    return dr.select(dr.isnan(a), a, dr.select(a < 0, 2 - tail, tail))
 
 
 @ft.cache
-def _erfc_series(degree: int) -> list[float]:
-    """Coefficients of `(1 + 2 x) exp(x^2) erfc(x)` in Chebyshev polynomials of
+def _erfc_coefficients(degree: int) -> list[float]:
+    """Coefficients of a polynomial for `(1 + 2 x) exp(x^2) erfc(x)`, in the variable
     `(x - middle) / (x + middle)`, which goes from -1 to 1 as `x` goes from 0 to infinity.
 
     The function changes from 1 to `2 / sqrt(pi)` only, without the exponential's decay, so
@@ -288,12 +246,14 @@ def _erfc_series(degree: int) -> list[float]:
     # that a cosine transform gives the coefficients, the first one doubled.
     series = np.asarray(dct((1 + 2 * x) * erfcx(x))) / num_nodes
     series[0] /= 2
-    return series[: degree + 1].tolist()
+    # Coefficients shrink faster than those of Chebyshev's polynomials grow, so that powers
+    # round as little, and are summed in half the operations.
+    return cheb2poly(series[: degree + 1]).tolist()
 
 
 def _rsqrt(a):
     # Dr.Jit's own is an approximation in single precision.
-    return 1 / drjit().sqrt(a)
+    return 1 / dr.sqrt(a)
 
 
 # Dr.Jit's own versions of `sinh`, `cosh` and `tanh` have single precision on GPUs.
@@ -303,12 +263,11 @@ def _half_exp(a):
     """Half of the exponential, which is finite also where the exponential overflows."""
     # The error of the root counts twice, so this serves only where the exponential
     # overflows.
-    root = drjit().exp(a / 2)
+    root = dr.exp(a / 2)
     return root / 2 * root
 
 
 def _sinh(a):
-    dr = drjit()
     size = dr.abs(a)
     expm1 = _expm1(size)
     overflows = dr.isinf(expm1)
@@ -321,7 +280,6 @@ def _sinh(a):
 
 
 def _cosh(a):
-    dr = drjit()
     size = dr.abs(a)
     exp = dr.exp(size)
     return dr.select(dr.isinf(exp), _half_exp(size), exp / 2 + 0.5 / exp)
@@ -330,8 +288,8 @@ def _cosh(a):
 def _tanh(a):
     # On CPUs Dr.Jit's own is as accurate, but gives 0 for -0, and in single precision -1
     # and 1 have different values. Of a negative number the exponential does not overflow.
-    expm1 = _expm1(-2 * drjit().abs(a))
-    return drjit().copysign(-expm1 / (expm1 + 2), a)
+    expm1 = _expm1(-2 * dr.abs(a))
+    return dr.copysign(-expm1 / (expm1 + 2), a)
 
 
 def _atanh(a):
@@ -341,13 +299,12 @@ def _atanh(a):
 
 
 def _logistic(a):
-    return 1 / (1 + drjit().exp(-a))
+    return 1 / (1 + dr.exp(-a))
 
 
 def _erf_inv(a):
     """In double precision Dr.Jit's version has at most the digits of single precision. Each
     step of Halley's method triples their number."""
-    dr = drjit()
     start = dr.erfinv(a)
     if dr.itemsize_v(a) < 8:
         return start
@@ -362,7 +319,6 @@ def _erf_inv(a):
 
 
 def _round_half_away(a):
-    dr = drjit()
     whole = dr.trunc(a)
     next_whole = whole + dr.copysign(type(a)(1), a)
     # The fraction is exact. The sum of `a` and one half would be rounded.
@@ -370,13 +326,9 @@ def _round_half_away(a):
     return dr.select(fraction >= 0.5, next_whole, whole)
 
 
-def _square(a):
-    return a * a
-
-
+@ft.cache
 def elementwise() -> dict[str, Callable[..., Any]]:
     """The functions, by their names in StableHLO and CHLO."""
-    dr = drjit()
     return {
         "abs": dr.abs,
         "acos": dr.acos,
@@ -417,7 +369,6 @@ def elementwise() -> dict[str, Callable[..., Any]]:
         "round_nearest_afz": _round_half_away,
         "round_nearest_even": dr.round,
         "rsqrt": _rsqrt,
-        "select": dr.select,
         "shift_left": shift_left,
         "shift_right_arithmetic": arithmetic_shift,
         "shift_right_logical": logical_shift,
@@ -425,7 +376,7 @@ def elementwise() -> dict[str, Callable[..., Any]]:
         "sine": dr.sin,
         "sinh": _sinh,
         "sqrt": dr.sqrt,
-        "square": _square,
+        "square": dr.square,
         "subtract": operator.sub,
         "tan": _tan,
         "tanh": _tanh,

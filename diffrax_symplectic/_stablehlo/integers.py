@@ -1,40 +1,20 @@
 """Integers, where Dr.Jit differs from StableHLO."""
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from .backend import array_types, drjit
-
-
-class SafeDivisor(NamedTuple):
-    """A divisor in place of an integer, by which another can be divided.
-
-    - `divisor`: the integer itself, or 1 where a processor would trap.
-    - `is_zero`, `is_minus_one`: the masks where the integer is 0 or -1.
-    """
-
-    divisor: Any
-    is_zero: Any
-    is_minus_one: Any
+from .backend import array_types, dr
 
 
 def safe_divisor(a, b):
-    """The divisor of `a` in place of `b`. Processors trap on division by zero, and of the
-    smallest integer by -1, whose quotient is beyond the largest."""
-    dr = drjit()
-    is_zero = b == 0
-    # A number without sign is never -1: the mask is false everywhere.
-    is_minus_one = (b == -1) if dr.is_signed_v(b) else ~is_zero & is_zero
-    overflows = is_minus_one & (a == _smallest_of_type(a))
-    safe = dr.select(is_zero | overflows, type(b)(1), b)
-    return SafeDivisor(safe, is_zero, is_minus_one)
-
-
-def _smallest_of_type(a):
-    """The smallest integer of the type of `a`."""
-    bits = 8 * drjit().itemsize_v(a)
-    return type(a)(-(2 ** (bits - 1)) if drjit().is_signed_v(a) else 0)
+    """The integer `b`, or 1 where a processor would trap on `a / b`: if `b` is zero; or if
+    it is -1 and `a` the smallest integer, whose quotient is beyond the largest."""
+    traps = b == 0
+    if dr.is_signed_v(b):
+        smallest = type(a)(-(2 ** (8 * dr.itemsize_v(a) - 1)))
+        traps = traps | ((b == -1) & (a == smallest))
+    return dr.select(traps, type(b)(1), b)
 
 
 # In Dr.Jit the type of a number decides whether a shift is logical or arithmetic, in
@@ -45,22 +25,22 @@ def _smallest_of_type(a):
 def shift_left(a, num_bits):
     num_bits = _without_sign(num_bits)
     # A shift by all bits or more gives zero. LLVM leaves it undefined.
-    is_by_fewer = num_bits < 8 * drjit().itemsize_v(a)
-    return drjit().select(is_by_fewer, a << type(a)(num_bits), 0)
+    is_by_fewer = num_bits < 8 * dr.itemsize_v(a)
+    return dr.select(is_by_fewer, a << type(a)(num_bits), 0)
 
 
 def logical_shift(a, num_bits):
     num_bits = _without_sign(num_bits)
     shifted = type(a)(_without_sign(a) >> num_bits)
-    return drjit().select(num_bits < 8 * drjit().itemsize_v(a), shifted, 0)
+    return dr.select(num_bits < 8 * dr.itemsize_v(a), shifted, 0)
 
 
 def arithmetic_shift(a, num_bits):
     num_bits = _without_sign(num_bits)
     signed = _with_same_bits("i", a)
     # A shift by all bits or more leaves the sign in all bits, as one by all but one does.
-    all_but_one = type(num_bits)(8 * drjit().itemsize_v(a) - 1)
-    bounded = drjit().select(num_bits < all_but_one, num_bits, all_but_one)
+    all_but_one = type(num_bits)(8 * dr.itemsize_v(a) - 1)
+    bounded = dr.select(num_bits < all_but_one, num_bits, all_but_one)
     return type(a)(signed >> type(signed)(bounded))
 
 
@@ -71,14 +51,13 @@ def _without_sign(a):
 def _with_same_bits(prefix: str, a: Any) -> Any:
     """The integer with the same bits as `a`, of a signed type (`i`) or one without sign
     (`ui`)."""
-    return array_types()[f"{prefix}{8 * drjit().itemsize_v(a)}"](a)
+    return array_types()[f"{prefix}{8 * dr.itemsize_v(a)}"](a)
 
 
 def to_integer(dtype: type, a: Any) -> Any:
     """The floating-point number `a` as an integer of this type, rounded to zero. What
     StableHLO leaves open is as in JAX: NaN becomes zero, and numbers out of range the
     smallest or the largest integer."""
-    dr = drjit()
     float_dtype = type(a)
     is_signed = dr.is_signed_v(dtype)
     bits = 8 * dr.itemsize_v(dtype)
@@ -93,5 +72,4 @@ def to_integer(dtype: type, a: Any) -> Any:
     # If the largest integer is no float, larger numbers have become a smaller integer.
     if int(float_below_end) < end - 1:
         integer = dr.select(a < end, integer, dtype(end - 1))
-    is_nan = ~(a == a)
-    return dr.select(is_nan, dtype(0), integer)
+    return dr.select(dr.isnan(a), dtype(0), integer)

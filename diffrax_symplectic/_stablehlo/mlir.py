@@ -1,5 +1,5 @@
-"""How operations of MLIR tell what they are: names, regions, attributes, constants, and the
-lines that they come from.
+"""How operations of MLIR tell what they are: names, regions, constants, and the lines that
+they come from. Their attributes are read in `operation.py`.
 
 MLIR's objects for Python promise little of this, and print some of it only. So it is used
 nowhere else, and `tests/stablehlo/test_mlir.py` tests each part by itself: if one of these
@@ -39,60 +39,6 @@ def block_of(op: Any, region: int = 0) -> Any:
 def operations_in(region: Any) -> list[Any]:
     """The operations of a region of MLIR, in their general form."""
     return [op.operation for block in region.blocks for op in block.operations]
-
-
-def sole_operation(region: Any) -> str | None:
-    """The name of the operation that is all that a region of MLIR does, on its arguments in
-    their order; `None` for other regions."""
-    operations = operations_in(region)
-    # The last operation returns.
-    if len(operations) != 2:
-        return None
-    op, _ = operations
-    (block,) = region.blocks
-    return op.name if [*op.operands] == [*block.arguments] else None
-
-
-def has_attribute(op: Any, name: str) -> bool:
-    """Whether an operation of MLIR has an attribute of this name."""
-    return name in op.attributes
-
-
-def attribute_integers(op: Any, name: str) -> list[int]:
-    """An attribute of MLIR that is a list of integers."""
-    return [int(i) for i in op.attributes[name]]
-
-
-def attribute_matrix(op: Any, name: str) -> np.ndarray:
-    """An attribute of MLIR that is a matrix of integers."""
-    return np.asarray(op.attributes[name])
-
-
-def attribute_value(op: Any, name: str) -> Any:
-    """An attribute of MLIR that is a number or a string."""
-    return op.attributes[name].value
-
-
-def attribute_entry(op: Any, name: str, key: str) -> Any:
-    """An entry of an attribute of MLIR that is a dictionary of numbers or strings."""
-    return op.attributes[name][key].value
-
-
-def attribute_enum(op: Any, name: str) -> str:
-    """The value of an enumeration, which MLIR only prints: of `LT` as
-    `#stablehlo<comparison_direction LT>`."""
-    return re.findall(r"\w+", str(op.attributes[name]))[-1]
-
-
-def attribute_part(op: Any, name: str, key: str) -> list[int]:
-    """An entry of an attribute with several, which MLIR only prints: as
-    `#stablehlo.gather<offset_dims = [0], index_vector_dim = 1>`. Entries that are zero or
-    empty are not printed."""
-    # A list in brackets, or one number.
-    entry = re.search(rf"\b{key} = (\[[^\]]*\]|\d+)", str(op.attributes[name]))
-    if entry is None:
-        return []
-    return [int(number) for number in re.findall(r"\d+", entry[1])]
 
 
 def constant_values(op: Any) -> np.ndarray:

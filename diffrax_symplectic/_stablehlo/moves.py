@@ -7,16 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from .backend import array_types, drjit
+from .backend import array_types, dr
 from .complex import equal, is_complex
 from .integers import to_integer
-from .operation import NotReplayed, Operation, rule
-from .tensor import constant, entries_of, map_entries, Tensor
+from .mlir import constant_values
+from .operation import Operation, rule
+from .tensor import constant, entries_of, is_same_table, map_entries, Tensor
 
 
 @rule
 def _constant(operation: Operation) -> list[Tensor]:
-    return [constant(operation.dtype, operation.value)]
+    return [constant(operation.dtype, constant_values(operation.mlir_op))]
 
 
 @rule
@@ -28,9 +29,8 @@ def _iota(operation: Operation) -> list[Tensor]:
 @rule
 def _broadcast_in_dim(operation: Operation, x: Tensor) -> list[Tensor]:
     # The shape of `x` with an axis for each of the result: new axes have length one.
-    sizes = [1] * len(operation.shape)
-    for axis, size in zip(operation.integers("broadcast_dimensions"), x.shape):
-        sizes[axis] = size
+    sizes = np.ones(len(operation.shape), int)
+    sizes[operation.integers("broadcast_dimensions")] = x.shape
     return [x.take(np.broadcast_to(x.places.reshape(sizes), operation.shape))]
 
 
@@ -68,25 +68,27 @@ def _concatenate(operation: Operation, *xs: Tensor) -> list[Tensor]:
 
 @rule
 def _pad(operation: Operation, x: Tensor, value: Tensor) -> list[Tensor]:
-    before = operation.integers("edge_padding_low")
-    between = operation.integers("interior_padding")
-    # For each axis, where in the result each index of `x` goes. A negative padding moves
-    # some out of the result.
-    indices_in_result = [
-        begin + np.arange(length) * (gap + 1)
-        for begin, gap, length in zip(before, between, x.shape)
-    ]
-    is_inside = [
-        (0 <= indices) & (indices < length)
-        for indices, length in zip(indices_in_result, operation.shape)
-    ]
-    targets = [indices[inside] for indices, inside in zip(indices_in_result, is_inside)]
+    before = np.array(operation.integers("edge_padding_low"), int)
+    distances = 1 + np.array(operation.integers("interior_padding"), int)
     # One list of the entries of `x` and the value, which comes last.
     all_entries = Tensor([*x.entries, value.item()], ())
-    place_of_value = len(x.entries)
-    places = np.full(operation.shape, place_of_value)
-    places[np.ix_(*targets)] = x.places[np.ix_(*is_inside)]
+    places = np.full(operation.shape, len(x.entries))
+    for index, place in np.ndenumerate(x.places):
+        target = before + np.array(index, int) * distances
+        # A negative padding moves some entries out of the result.
+        if np.all((target >= 0) & (target < operation.shape)):
+            places[tuple(target)] = place
     return [all_entries.take(places)]
+
+
+@rule
+def _select(
+    operation: Operation, mask: Tensor, if_true: Tensor, if_false: Tensor
+) -> list[Tensor]:
+    # `vmap` of a conditional selects between two equal tables: one stays in memory.
+    if is_same_table(if_true.entries, if_false.entries):
+        return [if_true]
+    return [map_entries(dr.select, mask, if_true, if_false)]
 
 
 @rule
@@ -96,7 +98,6 @@ def _convert(operation: Operation, x: Tensor) -> list[Tensor]:
 
 def _converted(dtype: type, entry: Any) -> Any:
     """An entry as a number of this type of Dr.Jit."""
-    dr = drjit()
     if type(entry) is dtype:
         return entry
     if dr.is_mask_v(dtype):
@@ -109,15 +110,8 @@ def _converted(dtype: type, entry: Any) -> Any:
 @rule
 def _bitcast_convert(operation: Operation, x: Tensor) -> list[Tensor]:
     if operation.shape != x.shape:
-        raise NotReplayed(
-            operation.mlir_op,
-            f"`{operation.full_name}` between numbers of different sizes",
-        )
-
-    def reinterpreted(entry: Any) -> Any:
-        return drjit().reinterpret_array(operation.dtype, entry)
-
-    return [map_entries(reinterpreted, x)]
+        raise operation.refusal("between numbers of different sizes")
+    return [map_entries(ft.partial(dr.reinterpret_array, operation.dtype), x)]
 
 
 @rule
@@ -129,21 +123,15 @@ def _complex(operation: Operation, real: Tensor, imag: Tensor) -> list[Tensor]:
 def _compare(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
     # The directions are called as Python's functions are, such as `LT`.
     direction = operation.word("comparison_direction").lower()
-    compare = getattr(operator, direction)
     if operation.has("compare_type") and operation.word("compare_type") == "TOTALORDER":
         a = map_entries(_in_total_order, a)
         b = map_entries(_in_total_order, b)
-    # All entries are of one type.
-    if is_complex(a.entries[0]):
-        # Complex numbers have no order: the direction is `eq` or `ne`.
-        is_equal = map_entries(equal, a, b)
-        return [
-            is_equal if direction == "eq" else map_entries(operator.invert, is_equal)
-        ]
-    if direction == "ne":
-        # NaN differs from everything. In Dr.Jit NaN != NaN is false, unless it is folded.
-        return [map_entries(operator.invert, map_entries(operator.eq, a, b))]
-    return [map_entries(compare, a, b)]
+    if direction not in ("eq", "ne"):
+        return [map_entries(getattr(operator, direction), a, b)]
+    # Complex numbers have no order, and are equal if both parts are.
+    is_equal = map_entries(equal if is_complex(a.entries[0]) else operator.eq, a, b)
+    # NaN differs from everything. In Dr.Jit NaN != NaN is false, unless it is folded.
+    return [is_equal if direction == "eq" else map_entries(operator.invert, is_equal)]
 
 
 def _in_total_order(a: Any) -> Any:
@@ -152,8 +140,8 @@ def _in_total_order(a: Any) -> Any:
     The bits of positive numbers, read as an integer, are in their order, and those of
     negative numbers in the reverse order.
     """
-    num_bits = 8 * drjit().itemsize_v(a)
-    bits = drjit().reinterpret_array(array_types()[f"i{num_bits}"], a)
+    num_bits = 8 * dr.itemsize_v(a)
+    bits = dr.reinterpret_array(array_types()[f"i{num_bits}"], a)
     # The shift copies the bit of the sign to all bits: of a negative number all are set, of
     # others none. So the last line flips all bits of negative numbers but the sign, which
     # reverses their order.

@@ -5,6 +5,7 @@ Their semantics: https://openxla.org/stablehlo/spec.
 
 import functools as ft
 import operator
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
@@ -12,17 +13,6 @@ import numpy as np
 
 from .._compat import is_literal
 from .backend import array_types
-from .mlir import (
-    attribute_entry,
-    attribute_enum,
-    attribute_integers,
-    attribute_matrix,
-    attribute_part,
-    attribute_value,
-    constant_values,
-    has_attribute,
-    sole_operation,
-)
 from .tensor import Tensor
 
 
@@ -52,7 +42,7 @@ class Operation(NamedTuple):
     @property
     def name(self) -> str:
         """The name without the dialect, such as `add`."""
-        return _without_dialect(self.full_name)
+        return self.full_name.split(".")[-1]
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -71,51 +61,47 @@ class Operation(NamedTuple):
         return array_types()[name]
 
     @property
-    def value(self) -> np.ndarray:
-        """The values of a constant."""
-        return constant_values(self.mlir_op)
-
-    @property
-    def reduces_by(self) -> str | None:
-        """The name of the operation that a reduction repeats, such as `add`; `None` if its
-        region does more than one."""
-        full_name = sole_operation(self.mlir_op.regions[ONLY_REGION])
-        return None if full_name is None else _without_dialect(full_name)
-
-    @property
     def shapes(self) -> list[tuple[int, ...]]:
         """The shapes of all results."""
         return [tuple(result.type.shape) for result in self.mlir_op.results]
 
-    # The methods below read an attribute of the operation, by its name in StableHLO.
+    def refusal(self, why: str) -> "NotReplayed":
+        """An error that says why an operation of this name cannot be replayed."""
+        return NotReplayed(self.mlir_op, f"`{self.full_name}` {why}")
+
+    # The methods below read an attribute of the operation, by its name in StableHLO. If
+    # one of them fails after an upgrade of JAX, print the operation.
 
     def has(self, name: str) -> bool:
-        return has_attribute(self.mlir_op, name)
+        return name in self.mlir_op.attributes
 
     def integers(self, name: str) -> list[int]:
-        return attribute_integers(self.mlir_op, name)
-
-    def optional_integers(self, name: str) -> list[int]:
-        """As `integers`; an empty list if there is no such attribute."""
-        return self.integers(name) if self.has(name) else []
+        """A list of integers, which is empty if there is no such attribute."""
+        return [int(i) for i in self.mlir_op.attributes[name]] if self.has(name) else []
 
     def integer(self, name: str) -> int:
-        return attribute_value(self.mlir_op, name)
+        return self.mlir_op.attributes[name].value
 
     def matrix(self, name: str) -> np.ndarray:
-        return attribute_matrix(self.mlir_op, name)
+        return np.asarray(self.mlir_op.attributes[name])
 
     def letter(self, name: str) -> str:
         """An argument of LAPACK, such as `U` for an upper triangle."""
-        return chr(attribute_entry(self.mlir_op, "mhlo.backend_config", name))
+        return chr(self.mlir_op.attributes["mhlo.backend_config"][name].value)
 
     def word(self, name: str) -> str:
-        """The value of an enumeration, such as `LT`."""
-        return attribute_enum(self.mlir_op, name)
+        """The value of an enumeration, which MLIR only prints: of `LT` as
+        `#stablehlo<comparison_direction LT>`."""
+        return re.findall(r"\w+", str(self.mlir_op.attributes[name]))[-1]
 
     def part(self, name: str, key: str) -> list[int]:
-        """An entry of an attribute with several, such as `offset_dims` of a `gather`."""
-        return attribute_part(self.mlir_op, name, key)
+        """An entry of an attribute with several, which MLIR only prints: as
+        `#stablehlo.gather<offset_dims = [0], index_vector_dim = 1>`. Entries that are zero
+        or empty are not printed."""
+        # A list in brackets, or one number.
+        text = str(self.mlir_op.attributes[name])
+        entry = re.search(rf"\b{key} = (\[[^\]]*\]|\d+)", text)
+        return [] if entry is None else [*map(int, re.findall(r"\d+", entry[1]))]
 
     def fail(self, mask: Any) -> None:
         """Marks the lanes of this mask as failed."""
@@ -133,10 +119,6 @@ class Operation(NamedTuple):
         del self.failures[num_before:]
         no_lane = array_types()["i1"](False)
         return returned, ft.reduce(operator.or_, new_failures, no_lane)
-
-
-def _without_dialect(full_name: str) -> str:
-    return full_name.split(".")[-1]
 
 
 class NotReplayed(Exception):

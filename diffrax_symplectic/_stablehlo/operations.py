@@ -1,75 +1,62 @@
-"""The table of operations that can be replayed. An elementwise operation is a line in
-`elementwise` or `complex`; any other is a function with the decorator `rule`."""
+"""Operations of each entry, by the tables of functions in `elementwise` and `complex`."""
 
-import functools as ft
+import operator
 from collections.abc import Callable
 from typing import Any
 
-from . import (  # noqa: F401 (they fill the table)
-    control_flow,
-    linear_algebra,
-    moves,
-    reductions,
-    windows,
-)
-from .angles import lanes_with_too_large_angle
-from .complex import complex_functions, is_complex
+from .backend import dr
+from .complex import complex_functions, is_complex, log_of_power
 from .elementwise import elementwise
-from .operation import NotReplayed, Operation, Rule, RULES
-from .tensor import map_entries, same_table, Tensor
+from .operation import NotReplayed, Operation
+from .tensor import map_entries, Tensor
 
 
-def rule_of(name: str) -> Rule | None:
-    """The rule for an operation, by its name without the dialect; `None` if it has none."""
+# The largest angles whose sine and cosine Dr.Jit has to a unit in the last place, for each
+# size of numbers in bytes. For twice this angle they are off by 4 units in single
+# precision, and by 1e138 in double.
+_LARGEST_ANGLES = {4: 2.0**13, 8: 2.0**31}
+
+
+def _itself(a):
+    return a
+
+
+# For each function, the angle whose sine or cosine it takes, as a function of its operands.
+_ANGLES_OF_REAL: dict[str, Callable[..., Any]] = {
+    "cosine": _itself,
+    "sine": _itself,
+    "tan": _itself,
+}
+_ANGLES_OF_COMPLEX: dict[str, Callable[..., Any]] = {
+    "cosine": operator.attrgetter("real"),
+    "exponential": operator.attrgetter("imag"),
+    "power": lambda base, exponent: log_of_power(base, exponent).imag,
+    "sine": operator.attrgetter("real"),
+}
+
+
+def entry_by_entry(operation: Operation, *xs: Tensor) -> list[Tensor]:
+    """The rule of all operations that have no rule of their own."""
+    name = operation.name
     of_real = elementwise().get(name)
     of_complex = complex_functions().get(name)
     if of_real is None and of_complex is None:
-        return RULES.get(name)
-
-    def entry_by_entry(operation: Operation, *xs: Tensor) -> list[Tensor]:
-        # Any operand may be the complex one: the first of a selection is its mask.
-        has_complex_operand = any(map(_has_complex_entries, xs))
-        function = of_complex if has_complex_operand else of_real
-        if function is None:
-            numbers = "complex numbers" if has_complex_operand else "real numbers"
-            raise NotReplayed(
-                operation.mlir_op, f"`{operation.full_name}` of {numbers}"
-            )
-        return [map_entries(ft.partial(_applied, operation, function), *xs)]
-
-    if name == "select":
-        return ft.partial(_select, entry_by_entry)
-    return entry_by_entry
-
-
-def _has_complex_entries(x: Tensor) -> bool:
+        raise NotReplayed(operation.mlir_op)
     # There is a first entry: `Replay` asks for no rule of arrays without entries.
-    return is_complex(x.entries[0])
+    has_complex_operand = any(is_complex(x.entries[0]) for x in xs)
+    function = of_complex if has_complex_operand else of_real
+    angles = _ANGLES_OF_COMPLEX if has_complex_operand else _ANGLES_OF_REAL
+    if function is None:
+        raise operation.refusal(
+            f"of {'complex' if has_complex_operand else 'real'} numbers"
+        )
 
+    def applied(*entries: Any) -> Any:
+        if name in angles:
+            # JAX simulates the paths of lanes that fail again.
+            angle = angles[name](*entries)
+            largest = _LARGEST_ANGLES[dr.itemsize_v(angle)]
+            operation.fail(dr.abs(angle) > largest)
+        return function(*entries)
 
-def _select(
-    entry_by_entry: Rule,
-    operation: Operation,
-    mask: Tensor,
-    if_true: Tensor,
-    if_false: Tensor,
-) -> list[Tensor]:
-    """The rule of a selection, `entry_by_entry` unless both choices are the same table."""
-    # `vmap` of a conditional selects between two equal tables: one stays in memory.
-    if same_table(if_true, if_false):
-        return [if_true]
-    return entry_by_entry(operation, mask, if_true, if_false)
-
-
-def _applied(operation: Operation, function: Callable, *entries: Any) -> Any:
-    """An elementwise function of one entry of each operand. Dr.Jit's sine is wrong beyond
-    some angle: lanes with a larger angle fail, and JAX simulates their paths again."""
-    failed = lanes_with_too_large_angle(operation.name, *entries)
-    if failed is not None:
-        operation.fail(failed)
-    return function(*entries)
-
-
-def names() -> set[str]:
-    """All operations in the table."""
-    return {*elementwise(), *complex_functions(), *RULES}
+    return [map_entries(applied, *xs)]

@@ -4,30 +4,20 @@ import functools as ft
 import itertools
 import math
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from .._compat import is_literal
-from .backend import drjit
-from .complex import is_complex
+from .backend import dr
 from .elementwise import is_zero
-from .operation import NotReplayed, ONLY_REGION, Operation, rule
-from .tensor import known_values, scalar, Tensor
+from .operation import ONLY_REGION, Operation, rule
+from .tensor import scalar, Tensor
 
 
 # The most numbers to sort: exchanges grow with the square of the number.
 _MOST_SORTED = 16
-
-
-def _is_real_float(a: Any) -> bool:
-    return drjit().is_float_v(a) and not is_complex(a)
-
-
-def _multiplied_and_added(a: Any, b: Any, c: Any) -> Any:
-    """`a b + c`, in one operation if it can be."""
-    return drjit().fma(a, b, c) if _is_real_float(c) else a * b + c
 
 
 @rule
@@ -47,10 +37,10 @@ def _dot_general(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
         row = [a_entries[place] for place in places_in_a[batch, i]]
         column = [b_entries[place] for place in places_in_b[batch, j]]
         total = dtype(0)
-        if _is_real_float(total):
+        if dr.is_float_v(dtype) and not dr.is_complex_v(dtype):
             total = total + _sum_left_out(row, column) + _sum_left_out(column, row)
         for x, y in zip(row, column):
-            total = _multiplied_and_added(x, y, total)
+            total = dr.fma(x, y, total)
         results.append(total)
     return [Tensor(results, operation.shape)]
 
@@ -82,116 +72,61 @@ def _as_matrices(operation: Operation, x: Tensor, side: str) -> np.ndarray:
 
 
 @rule
-def _reduce(operation: Operation, *xs: Tensor) -> list[Tensor]:
-    arrays, initial = _arrays_and_initial(xs)
-    shape = arrays[0].shape
+def _reduce(operation: Operation, *operands: Tensor) -> list[Tensor]:
+    x = operands[0]
     axes = operation.integers("dimensions")
-    kept = [axis for axis in range(len(shape)) if axis not in axes]
-    shape_of_results = tuple(shape[axis] for axis in kept)
-    # (entries of a result, entries that are reduced to one)
-    num_results = math.prod(shape_of_results)
-    places = arrays[0].places.transpose(*kept, *axes).reshape(num_results, -1)
-    starts_neutral = _starts_neutral(operation, initial)
-    totals = []
-    for places_of_total in places:
-        parts = [_entries_at(arrays, place) for place in places_of_total]
-        # A neutral element, such as zero in a sum, is left out: the first part takes its
-        # place.
-        total = parts.pop(0) if parts and starts_neutral else [*initial]
-        for part in parts:
-            total = operation.run(ONLY_REGION, [*total, *part])
-        totals.append(total)
-    return _arrays_of(totals, shape_of_results, len(arrays))
+    kept = [axis for axis in range(len(x.shape)) if axis not in axes]
+    places = x.places.transpose(*kept, *axes)
+    return _reduced(operation, operands, places.reshape(math.prod(operation.shape), -1))
 
 
-def _arrays_and_initial(
-    operands: Sequence[Tensor],
-) -> tuple[Sequence[Tensor], Sequence[Tensor]]:
-    """The two halves of the operands of a reduction: arrays of one shape, and the value
-    from which each starts. Several arrays are reduced together where the result of one
-    depends on the others, such as values and places for `argmax`."""
-    num_arrays = len(operands) // 2
-    return operands[:num_arrays], operands[num_arrays:]
-
-
-def _entries_at(arrays: Sequence[Tensor], place: Any) -> list[Tensor]:
-    """The entries of all these arrays at a place, each as an array without axes."""
-    return [scalar(x.entries[place]) for x in arrays]
-
-
-def _arrays_of(
-    totals: list[list[Tensor]], shape: tuple[int, ...], num_arrays: int
+def _reduced(
+    operation: Operation, operands: Sequence[Tensor], groups: Iterable[Iterable[Any]]
 ) -> list[Tensor]:
-    """Arrays of this shape. `totals` are their entries in row-major order, each a list with
-    the entry of each array, as an array without axes."""
-    arrays = []
-    for k in range(num_arrays):
-        entries = [total[k].item() for total in totals]
-        arrays.append(Tensor(entries, shape))
-    return arrays
+    """The results of a reduction. `groups` has the places of the entries that are reduced
+    to one, for each entry of a result in row-major order.
 
-
-# Neutral elements, by the operation that is repeated.
-_NEUTRAL = {
-    "add": 0,
-    "multiply": 1,
-    "maximum": -np.inf,
-    "minimum": np.inf,
-    "or": False,
-}
-
-
-def _starts_neutral(operation: Operation, initial: Sequence[Tensor]) -> bool:
-    """Whether a reduction starts from the neutral element of its operation."""
-    if len(initial) > 1:
-        return False
-    value = known_values(initial[0])
-    repeated = operation.reduces_by
-    if value is None or repeated is None:
-        return False
-    if repeated == "and":
-        # The neutral element has all bits set, which the integer 1 has not.
-        return bool(~value == 0)
-    return bool(value == _NEUTRAL.get(repeated))
+    The first half of the operands are arrays of one shape, the others the values from which
+    each starts. Several arrays are reduced together where the result of one depends on the
+    others, such as values and places for `argmax`.
+    """
+    num_arrays = len(operands) // 2
+    arrays = operands[:num_arrays]
+    totals = []
+    for places in groups:
+        total = operands[num_arrays:]
+        for place in places:
+            entries = [scalar(x.entries[place]) for x in arrays]
+            total = operation.run(ONLY_REGION, [*total, *entries])
+        totals.append([x.item() for x in total])
+    return [Tensor(entries, operation.shape) for entries in zip(*totals)]
 
 
 @rule
-def _reduce_window(operation: Operation, *xs: Tensor) -> list[Tensor]:
+def _reduce_window(operation: Operation, *operands: Tensor) -> list[Tensor]:
     """Cumulative sums, and other reductions of windows."""
-    arrays, initial = _arrays_and_initial(xs)
-    if any(size > 1 for size in operation.optional_integers("base_dilations")):
-        raise NotReplayed(
-            operation.mlir_op, f"`{operation.full_name}` of entries that are apart"
-        )
-    shape = arrays[0].shape
-    ones = [1] * len(shape)
+    if any(size > 1 for size in operation.integers("base_dilations")):
+        raise operation.refusal("of entries that are apart")
+    x = operands[0]
     sizes = operation.integers("window_dimensions")
-    strides = np.array(operation.optional_integers("window_strides") or ones)
-    distances = np.array(operation.optional_integers("window_dilations") or ones)
-    padding_before = _padding_before(operation, len(shape))
-    totals = []
+    strides = np.array(operation.integers("window_strides") or 1)
+    distances = np.array(operation.integers("window_dilations") or 1)
+    # Pairs of the padding before and after, for each axis.
+    padding = (
+        operation.matrix("padding") if operation.has("padding") else np.zeros(2, int)
+    )
+    padding_before = padding.reshape(-1, 2)[:, 0]
+    groups = []
     for window in np.ndindex(*operation.shape):
         corner = np.array(window) * strides - padding_before
-        total = [*initial]
-        for offset in np.ndindex(*sizes):
-            index = corner + np.array(offset) * distances
-            # What lies in the padding is left out, as XLA does. The specification has the
-            # initial value there, which is the same if it is neutral.
-            if np.all((index >= 0) & (index < shape)):
-                place = arrays[0].places[tuple(index)]
-                entries = _entries_at(arrays, place)
-                total = operation.run(ONLY_REGION, [*total, *entries])
-        totals.append(total)
-    return _arrays_of(totals, operation.shape, len(arrays))
-
-
-def _padding_before(operation: Operation, num_axes: int) -> np.ndarray:
-    """How far a `reduce_window` pads its arrays at the beginning of each axis."""
-    if not operation.has("padding"):
-        return np.zeros(num_axes, int)
-    # Pairs of the padding before and after. Without axes, there are none.
-    before, _ = operation.matrix("padding").reshape(num_axes, 2).T
-    return before
+        indices = [
+            corner + np.array(offset) * distances for offset in np.ndindex(*sizes)
+        ]
+        # What lies in the padding is left out, as XLA does. The specification has the
+        # initial value there, which is the same if it is neutral.
+        inside = [i for i in indices if np.all((i >= 0) & (i < x.shape))]
+        groups.append([x.places[tuple(index)] for index in inside])
+    return _reduced(operation, operands, groups)
 
 
 @rule
@@ -200,32 +135,21 @@ def _sort(operation: Operation, *xs: Tensor) -> list[Tensor]:
     axis = operation.integer("dimension")
     length = xs[0].shape[axis]
     if length > _MOST_SORTED:
-        raise NotReplayed(
-            operation.mlir_op,
-            f"`{operation.full_name}` of more than {_MOST_SORTED} numbers",
-        )
+        raise operation.refusal(f"of more than {_MOST_SORTED} numbers")
     # Arrays that are sorted together: the first ones may be keys of the others.
     arrays = [[*x.entries] for x in xs]
     for places in np.moveaxis(xs[0].places, axis, -1).reshape(-1, length):
         # After each round the largest of those left is at their end.
         for end in range(length, 1, -1):
             for left, right in itertools.pairwise(places[:end]):
-                _put_in_order(operation, arrays, left, right)
+                # The region takes two entries of each array in turn, and says whether the
+                # first of two must stand before the second. It gets the right one as the
+                # first: for equals it says no, so that they stay.
+                pairs = [scalar(x[place]) for x in arrays for place in (right, left)]
+                (right_comes_first,) = operation.run(ONLY_REGION, pairs)
+                is_wrong_order = right_comes_first.item()
+                for x in arrays:
+                    new_left = dr.select(is_wrong_order, x[right], x[left])
+                    x[right] = dr.select(is_wrong_order, x[left], x[right])
+                    x[left] = new_left
     return [Tensor(entries, x.shape) for entries, x in zip(arrays, xs)]
-
-
-def _put_in_order(
-    operation: Operation, arrays: list[list[Any]], left: int, right: int
-) -> None:
-    """Exchanges the entries at two places, in all arrays, where the order is wrong."""
-    # The region takes two entries of each array in turn, and says whether the first of two
-    # must stand before the second. It gets the right one as the first: for equals it says
-    # no, so that they stay.
-    pairs = [scalar(entries[place]) for entries in arrays for place in (right, left)]
-    (right_comes_first,) = operation.run(ONLY_REGION, pairs)
-    is_wrong_order = right_comes_first.item()
-    select = drjit().select
-    for entries in arrays:
-        new_left = select(is_wrong_order, entries[right], entries[left])
-        entries[right] = select(is_wrong_order, entries[left], entries[right])
-        entries[left] = new_left

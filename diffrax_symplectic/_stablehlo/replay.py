@@ -7,9 +7,16 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from .._compat import stablehlo_module
+from . import (  # noqa: F401 (they fill `RULES`)
+    control_flow,
+    linear_algebra,
+    moves,
+    reductions,
+    windows,
+)
 from .mlir import block_of, callee_of, constant_values, functions_of, operations_in
-from .operation import NotReplayed, Operation
-from .operations import rule_of
+from .operation import NotReplayed, Operation, RULES
+from .operations import entry_by_entry
 from .tensor import array_in_memory, ArrayType, MOST_IN_REGISTERS, Table, Tensor
 
 
@@ -34,7 +41,13 @@ class Replay:
         # The module owns the operations, so that it must be kept.
         self._module = stablehlo_module(program)
         self._functions = functions_of(self._module)
-        self._constants = _large_constants([*self._functions.values()])
+        # The constants of more entries than stay in registers, by their variables.
+        self._constants = {
+            op.results[0]: constant_values(op)
+            for op in _operations_within(self._module.operation)
+            if op.name == "stablehlo.constant"
+            and _type_of(op.results[0]).size > MOST_IN_REGISTERS
+        }
         self._memory: dict[Any, Any] = {}
 
     @property
@@ -134,9 +147,7 @@ class Replay:
             return self._run_block(block_of(op, i), args, values, failures)
 
         operation = Operation(op, run, failures)
-        rule = rule_of(operation.name)
-        if rule is None:
-            raise NotReplayed(op)
+        rule = RULES.get(operation.name, entry_by_entry)
         try:
             return rule(operation, *operands)
         except (TypeError, RuntimeError) as error:
@@ -171,23 +182,9 @@ def _is_empty(variable: Any) -> bool:
     return 0 in getattr(variable.type, "shape", ())
 
 
-def _large_constants(functions: list[Any]) -> dict[Any, np.ndarray]:
-    """The constants of more entries than stay in registers, by their variables."""
-    values = {}
-    for op in _operations(functions):
-        if op.name != "stablehlo.constant":
-            continue
-        (variable,) = op.results
-        if _type_of(variable).size > MOST_IN_REGISTERS:
-            values[variable] = constant_values(op)
-    return values
-
-
-def _operations(functions: list[Any]) -> Iterator[Any]:
-    """All operations of these functions, those in regions included."""
-    remaining = [function.operation for function in functions]
-    while remaining:
-        op = remaining.pop()
-        yield op
-        for region in op.regions:
-            remaining.extend(operations_in(region))
+def _operations_within(op: Any) -> Iterator[Any]:
+    """All operations in the regions of an operation, and in their regions."""
+    for region in op.regions:
+        for inner in operations_in(region):
+            yield inner
+            yield from _operations_within(inner)

@@ -1,14 +1,15 @@
 """Arrays of one path as lists of Dr.Jit arrays, each with one entry for all paths."""
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from .._compat import is_literal
-from .backend import array_types, drjit
+from .backend import array_types, dr
 
 
 # Larger arrays that all paths share stay in memory: each entry in registers is a variable
@@ -16,7 +17,8 @@ from .backend import array_types, drjit
 MOST_IN_REGISTERS = 64
 
 
-class ArrayType(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class ArrayType:
     """The shape of an array, and StableHLO's name of the type of its entries (`f64`)."""
 
     shape: tuple[int, ...]
@@ -61,10 +63,11 @@ class Table(Sequence):
 
     def gathered(self, addresses: Any) -> Any:
         """What is at these addresses in `memory`, one for each path."""
-        return drjit().gather(type(self.memory), self.memory, addresses)
+        return dr.gather(type(self.memory), self.memory, addresses)
 
 
-class Tensor(NamedTuple):
+@dataclasses.dataclass(frozen=True)
+class Tensor:
     """An array whose entries, in row-major order, are Dr.Jit arrays with one lane for each
     path."""
 
@@ -90,10 +93,8 @@ class Tensor(NamedTuple):
         return entry
 
 
-def same_table(a: Tensor, b: Tensor) -> bool:
+def is_same_table(one: Sequence[Any], other: Sequence[Any]) -> bool:
     """Whether both are the same part of the same array in memory."""
-    one = a.entries
-    other = b.entries
     if not (isinstance(one, Table) and isinstance(other, Table)):
         return False
     return one.memory is other.memory and np.array_equal(one.addresses, other.addresses)
@@ -135,7 +136,7 @@ def known_values(x: Tensor) -> np.ndarray | None:
 
 def _value(literal: Any) -> Any:
     """The number in a literal of Dr.Jit."""
-    if drjit().is_complex_v(literal):
+    if dr.is_complex_v(literal):
         return complex(literal.real[0], literal.imag[0])
     return literal[0]
 
@@ -184,22 +185,7 @@ def as_own_literal(entry: Any) -> Any:
     """An entry that a conditional or loop returned, for use after it. If both branches
     return the same constant, Dr.Jit returns the constant of the second branch, which is
     defined within it only: LLVM aborts the process if an outer branch returns that."""
-    if drjit().is_complex_v(entry):
+    if dr.is_complex_v(entry):
         # One part of a complex number may be a constant, and the other not.
         return type(entry)(as_own_literal(entry.real), as_own_literal(entry.imag))
     return type(entry)(entry[0]) if is_literal(entry) else entry
-
-
-def elements_where(xs: Sequence[Any], mask: Sequence[bool]) -> list[Any]:
-    """The elements of `xs` where the mask is true."""
-    return [x for x, is_true in zip(xs, mask, strict=True) if is_true]
-
-
-def elements_of_both(
-    mask: Sequence[bool], where_true: Iterable[Any], where_false: Iterable[Any]
-) -> list[Any]:
-    """One list of two, as long as the mask: the next element of `where_true` where the mask
-    is true, and of `where_false` elsewhere. `elements_where` takes them apart again."""
-    true_elements = iter(where_true)
-    false_elements = iter(where_false)
-    return [next(true_elements if is_true else false_elements) for is_true in mask]

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import jax.random as jr
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._stablehlo import drjit
+from diffrax_symplectic._stablehlo import dr
 
 from ..drjit_here import needs_drjit
 
@@ -30,7 +30,6 @@ TERMS = ds.hamiltonian_terms(spring, push, ds.WeakBrownianPath((), jr.key(0)))
 
 @needs_drjit
 def test_batches_share_their_kernels():
-    dr = drjit()
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
         ds.ensemble(

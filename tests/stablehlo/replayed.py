@@ -9,7 +9,7 @@ import numpy as np
 from diffrax_symplectic._stablehlo import (
     array_in_memory,
     array_types,
-    drjit,
+    dr,
     Replay,
     Tensor,
 )
@@ -51,7 +51,7 @@ def _replayed_lanes(
     replay = Replay(program)
     tensors = [tensor(x, of.kind) for x, of in zip(args, replay.arguments)]
     results, errors = replay(*tensors, constants=replay.constants())
-    drjit().eval(errors, *[result.entries for result in results])
+    dr.eval(errors, *[result.entries for result in results])
     number = len(args[0])
     arrays = [
         stacked(x, of.kind, number).reshape(number, *x.shape)
@@ -76,7 +76,7 @@ def tensor(x: np.ndarray, kind: str) -> Tensor:
 
 def lanes(entry: Any, number: int) -> np.ndarray:
     """The values of an entry in each lane."""
-    if not drjit().is_complex_v(entry):
+    if not dr.is_complex_v(entry):
         return np.broadcast_to(np.asarray(entry), number)
-    unit = np.array(1j, f"c{2 * drjit().itemsize_v(entry)}")
+    unit = np.array(1j, f"c{2 * dr.itemsize_v(entry)}")
     return lanes(entry.real, number) + unit * lanes(entry.imag, number)

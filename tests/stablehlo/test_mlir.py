@@ -8,6 +8,7 @@ import pytest
 
 from diffrax_symplectic._compat import stablehlo_module
 from diffrax_symplectic._stablehlo import mlir
+from diffrax_symplectic._stablehlo.operation import Operation
 
 
 # A module of MLIR owns its operations, and frees them.
@@ -25,6 +26,11 @@ def _operation(lowered, name: str):
     main = mlir.functions_of(_MODULES[-1])["main"]
     operations = mlir.operations_in(main.operation.regions[0])
     return next(op for op in operations if op.name == name)
+
+
+def _rules_see(lowered, name: str) -> Operation:
+    """As `_operation`, in the form that rules see."""
+    return Operation(_operation(lowered, name), run=lambda *_: [], failures=[])
 
 
 def test_a_program_in_stablehlo_is_the_same_as_text_and_as_a_module():
@@ -45,58 +51,48 @@ def test_a_program_in_stablehlo_is_the_same_as_text_and_as_a_module():
 
 
 def test_attributes_of_operations_are_read():
-    """If this fails: print the operation and its attributes, and adapt the function of
-    `_stablehlo/mlir.py` for this kind of attribute."""
-    slice_of = _operation(_lowered(lambda x: x[1:4:2], (5,)), "stablehlo.slice")
-    assert mlir.attribute_integers(slice_of, "strides") == [2]
-    assert mlir.has_attribute(slice_of, "strides")
-    assert not mlir.has_attribute(slice_of, "dimension")
+    """If this fails: print the operation and its attributes, and adapt the method of
+    `Operation` for this kind of attribute."""
+    slice_of = _rules_see(_lowered(lambda x: x[1:4:2], (5,)), "stablehlo.slice")
+    assert slice_of.integers("strides") == [2]
+    assert slice_of.has("strides")
+    assert not slice_of.has("dimension") and slice_of.integers("dimension") == []
     joined = _lowered(lambda x: jnp.concatenate([x, x], axis=1), (2, 3))
-    joined = _operation(joined, "stablehlo.concatenate")
-    assert mlir.attribute_value(joined, "dimension") == 1
-    less = _operation(_lowered(lambda x: x < 1, ()), "stablehlo.compare")
-    assert mlir.attribute_enum(less, "comparison_direction") == "LT"
+    joined = _rules_see(joined, "stablehlo.concatenate")
+    assert joined.integer("dimension") == 1
+    less = _rules_see(_lowered(lambda x: x < 1, ()), "stablehlo.compare")
+    assert less.word("comparison_direction") == "LT"
     product = _lowered(lambda a, b: jnp.einsum("kij,klj->kil", a, b), *[(2, 3, 3)] * 2)
-    product = _operation(product, "stablehlo.dot_general")
-    part = lambda key: mlir.attribute_part(product, "dot_dimension_numbers", key)
+    product = _rules_see(product, "stablehlo.dot_general")
+    part = lambda key: product.part("dot_dimension_numbers", key)
     assert part("lhs_batching_dimensions") == [0]
     assert part("rhs_contracting_dimensions") == [2]
     assert part("no_such_dimensions") == []
 
 
 def test_regions_of_operations_are_read():
-    """If this fails: print the operation, and adapt `attribute_matrix`, `operations_in` or
-    `sole_operation`."""
+    """If this fails: print the operation, and adapt `Operation.matrix` or
+    `operations_in`."""
 
     def windows(x):
         padding = ((1, 0), (0, 2))
         return jax.lax.reduce_window(x, 0.0, jax.lax.add, (2, 1), (1, 1), padding)
 
-    reduction = _operation(_lowered(windows, (4, 3)), "stablehlo.reduce_window")
-    assert mlir.attribute_matrix(reduction, "padding").tolist() == [[1, 0], [0, 2]]
-    inside = mlir.operations_in(reduction.regions[0])
+    reduction = _rules_see(_lowered(windows, (4, 3)), "stablehlo.reduce_window")
+    assert reduction.matrix("padding").tolist() == [[1, 0], [0, 2]]
+    inside = mlir.operations_in(reduction.mlir_op.regions[0])
     assert [op.name for op in inside] == ["stablehlo.add", "stablehlo.return"]
-    assert mlir.sole_operation(reduction.regions[0]) == "stablehlo.add"
-
-    def sole(fn):
-        reduced = _lowered(lambda x: jax.lax.reduce(x, jnp.float32(0), fn, (0,)), (3,))
-        return mlir.sole_operation(_operation(reduced, "stablehlo.reduce").regions[0])
-
-    assert sole(lambda a, b: a * b) == "stablehlo.multiply"
-    assert sole(lambda a, b: (a + b) * 0.5) is None
-    assert sole(lambda a, b: a + a) is None
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="LAPACK is for CPUs")
 def test_calls_of_lapack_are_known_by_name_with_their_arguments():
-    """If this fails: print the operation, and adapt `call_target`, `attribute_entry`, or
+    """If this fails: print the operation, and adapt `call_target`, `Operation.letter`, or
     the table of calls in `_stablehlo/linear_algebra.py`."""
-    factor = _operation(
+    factor = _rules_see(
         _lowered(jax.lax.linalg.cholesky, (2, 2)), "stablehlo.custom_call"
     )
-    assert mlir.call_target(factor) == "lapack_spotrf_ffi"
-    uplo = mlir.attribute_entry(factor, "mhlo.backend_config", "uplo")
-    assert chr(uplo) == "L"
+    assert mlir.call_target(factor.mlir_op) == "lapack_spotrf_ffi"
+    assert factor.letter("uplo") == "L"
 
 
 CONSTANTS = [
