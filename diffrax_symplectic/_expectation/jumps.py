@@ -169,6 +169,11 @@ class _Steps(NamedTuple):
     near: float
     far: float
 
+    @property
+    def around(self) -> Float[np.ndarray, "4"]:
+        """The times at which fields are compared, from a time between them on."""
+        return np.array([-self.far, -self.near, self.near, self.far])
+
 
 def _steps_to_look_at(problem: Problem) -> _Steps | None:
     """The first steps of the finest level; `None` where times are rounded so coarsely, as
@@ -189,18 +194,14 @@ def _times_of_jumps(problem: Problem, steps: _Steps) -> Float[np.ndarray, " jump
     """When the forces or the noise jump within steps, not at their ends."""
     # Jumps that are nearer than this to an end of a step do as little harm as those at it,
     # so both ends are left out.
-    interiors = np.stack(
-        [steps.starts + steps.far, steps.starts + steps.h - steps.far], axis=1
-    )
+    interior = np.array([steps.far, steps.h - steps.far])
+    interiors = (steps.starts[:, None] + interior).astype(problem.dtype)
     # Bisection goes on until a part of a step is no longer than `near`.
     halvings = max(0, int(np.ceil(np.log2(steps.h / _PARTS_OF_STEP / steps.near))))
-    around = np.array([-steps.far, -steps.near, steps.near, steps.far])
-    dtype = problem.dtype
-    field = all_fields(problem)
-    times, is_jump = _search(
-        field, problem.y0, interiors.astype(dtype), halvings, around.astype(dtype)
-    )
-    return np.asarray(times)[np.asarray(is_jump)]
+    around = steps.around.astype(problem.dtype)
+    found = _search(all_fields(problem), problem.y0, interiors, halvings, around)
+    times, is_jump = map(np.asarray, found)
+    return times[is_jump]
 
 
 def _first_jump_at_end(field: Field, problem: Problem, y0: Y) -> float | None:
@@ -213,8 +214,7 @@ def _first_jump_at_end(field: Field, problem: Problem, y0: Y) -> float | None:
         return None
     ends = steps.starts + steps.h
     is_last = np.arange(1, len(ends) + 1) == problem.finest_steps
-    offsets = np.array([-steps.far, -steps.near, steps.near, steps.far, 0])
-    times = (ends[:, None] + offsets).astype(problem.dtype)
+    times = (ends[:, None] + np.append(steps.around, 0)).astype(problem.dtype)
     jumps = _jumps_at_ends(field, y0, times, is_last)
     return float(ends[np.argmax(jumps)]) if np.any(jumps) else None
 

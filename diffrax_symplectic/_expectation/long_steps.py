@@ -166,7 +166,7 @@ def _largest_angle(problem: Problem) -> tuple[float, np.floating]:
     """The largest angle by which a step on the first level turns the state in which paths
     start, by the drift without friction, in radians; and the number of this step."""
     step_numbers = _step_numbers_to_look_at(problem)
-    frequencies = np.asarray(_frequencies(problem, step_numbers))
+    frequencies = np.asarray(drift_frequencies(problem, step_numbers))
     largest = np.argmax(frequencies)
     angle = float(frequencies[largest]) * float(problem.level(0).h)
     return angle, step_numbers[largest]
@@ -290,7 +290,7 @@ def _growth_in_steps(problem: Problem, numbers: Float[Array, " times"]) -> Growt
 
 
 @ft.partial(compiled, quickly=True)
-def _frequencies(
+def drift_frequencies(
     problem: Problem, numbers: Float[Array, " times"]
 ) -> Float[Array, " times"]:
     """The largest angular frequency of the drift without friction at `y0`, at the starts of

@@ -7,6 +7,7 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
@@ -32,7 +33,8 @@ from .._terms import (
     tree_sum,
 )
 from .fields_in_time import drift_rate
-from .linear_maps import largest_frequency, largest_growth, linearized
+from .linear_maps import largest_growth, linearized
+from .long_steps import drift_frequencies
 
 
 # With a flow, a mode relaxes too slowly if it turns by more than this in a step, and the
@@ -96,7 +98,7 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
     may_change = not Dependence(force, q0, p0).independent(lambda q, velocity: q)
     if most_friction is None and not has_flow and not may_change:
         return None
-    friction_of_step, angle = (float(rate) * dt0 for rate in _rates(problem))
+    friction_of_step = float(_friction_rate(problem)) * dt0
     if most_friction is not None and friction_of_step > most_friction:
         return (
             f"{beginning} the friction: momenta decay at a rate of "
@@ -104,7 +106,11 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
             f"temperature only up to {most_friction:g} / `dt0`. Pass a smaller `dt0`, or "
             "`BAOAB()`, which takes every friction."
         )
-    if has_flow and friction_of_step > _MOST_BY_FLOW and angle > _MOST_BY_FLOW:
+    angle = 0.0
+    if has_flow and friction_of_step > _MOST_BY_FLOW:
+        (frequency,) = drift_frequencies(problem, np.zeros(1, problem.dtype))
+        angle = float(frequency) * dt0
+    if angle > _MOST_BY_FLOW:
         return (
             f"{beginning} a vibration with strong friction, omega h = {angle:.3g} where "
             f"paths start: with a `flow`, `{name}` keeps its stationary law, but takes its "
@@ -178,23 +184,19 @@ def _change_along_step(problem: Problem) -> Float[Array, ""]:
 
 
 @ft.partial(compiled, quickly=True)
-def _rates(problem: Problem) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The largest rates of the equation at the start: the rate at which friction takes away
-    a momentum, and the angular frequency of a vibration without friction."""
-    drift, friction, _ = split_friction(problem.terms)
+def _friction_rate(problem: Problem) -> Float[Array, ""]:
+    """The largest rate at which friction takes away a momentum at the start."""
+    _, friction, _ = split_friction(problem.terms)
     p0, q0 = problem.y0
 
-    def friction_force(t: Array, p: PyTree[Array]) -> PyTree[Array]:
-        force, _ = rate(friction, t, (p, q0), problem.args)
-        return force
+    def force(t: Array, p: PyTree[Array]) -> PyTree[Array]:
+        return rate(friction, t, (p, q0), problem.args)[0]
 
-    force_by_p, flat_p0 = linearized(friction_force, problem.t0, p0)
+    force_by_p, flat_p0 = linearized(force, problem.t0, p0)
+    growth = largest_growth(force_by_p, flat_p0, _ITERATIONS)
     # Eigenvalues are real for symmetric masses and friction, and negative where friction
     # damps.
-    growth = largest_growth(force_by_p, flat_p0, _ITERATIONS)
-    field = jtu.Partial(drift_rate, drift, problem.args)
-    frequency = largest_frequency(field, problem.t0, problem.y0)
-    return jnp.maximum(-growth.rayleigh_quotient, 0), frequency
+    return jnp.maximum(-growth.rayleigh_quotient, 0)
 
 
 @ft.partial(compiled, quickly=True)
