@@ -121,7 +121,11 @@ def _moments_on_device(
     those of `_moments_on_devices`."""
     # The places of the samples among those of all devices.
     index = device * samples_per_device + jnp.arange(samples_per_device)
-    high, low = _high_and_low_of_sum(low_high, index)
+    # The number of each sample. (JAX may have no 64-bit integers.)
+    low = low_high[0] + index.astype(jnp.uint32)
+    # The sum has wrapped around if it is less than one of its terms.
+    has_carry = low < low_high[0]
+    high = low_high[1] + has_carry.astype(jnp.uint32)
     key = jr.wrap_key_data(jnp.asarray(key_data), impl=key_impl)
 
     def sample_key(high: Array, low: Array) -> PRNGKeyArray:
@@ -139,65 +143,36 @@ def _moments_on_device(
         any_failed |= jnp.any(samples.also_failed & is_wanted)
     fields = samples.averaged.fields
     # All fields are summed at once, since fewer operations compile sooner.
-    moments = _moments_of_fields(jnp.stack([*fields.values()]), good)
-    averaged_moments = {
-        name: Averaged(**dict(zip(fields, of_fields)))
-        for name, of_fields in moments.items()
-    }
-    return BatchMoments(
-        num_good=jnp.sum(good),
-        num_failed=num_failed_on_any,
-        failed_on=jnp.sum(failures, axis=1),
-        any_failed=any_failed,
-        **averaged_moments,
-    )
-
-
-def _high_and_low_of_sum(
-    low_high: UInt32[Array, "2"], index: Int[Array, " n"]
-) -> tuple[UInt32[Array, " n"], UInt32[Array, " n"]]:
-    """The high and the low 32 bits of the sum of a number and each `index`. The low bits of
-    the number come first in `low_high`. (JAX may have no 64-bit integers.)"""
-    first_low = low_high[0]
-    first_high = low_high[1]
-    low = first_low + index.astype(jnp.uint32)
-    # The sum has wrapped around if it is less than one of its terms.
-    has_carry = low < first_low
-    high = first_high + has_carry.astype(jnp.uint32)
-    return high, low
+    moments_of_fields = _moments_of_fields(jnp.stack([*fields.values()]), good)
+    averaged = [Averaged(**dict(zip(fields, x))) for x in moments_of_fields]
+    failed_on = jnp.sum(failures, axis=1)
+    counts = jnp.sum(good), num_failed_on_any, failed_on, any_failed
+    return BatchMoments(*counts, *averaged)
 
 
 def _moments_of_fields(
     x: Float[Array, "fields combinations n numbers"], good: Bool[Array, " n"]
-) -> dict[str, Float[Array, "fields combinations numbers"]]:
-    """The fields of `BatchMoments` that are an `Averaged`, by their names."""
+) -> tuple[Float[Array, "fields combinations numbers"], ...]:
+    """The fields of `BatchMoments` that are an `Averaged`, in their order."""
     is_used = good[:, None]
     # Sums over no samples are zero, and so are then their means.
     divisor = jnp.maximum(jnp.sum(good), 1)
-
-    def largest_of_samples(x: Array) -> Array:
-        return jnp.max(jnp.abs(x), axis=2)
-
     x = jnp.where(is_used, x, 0)
-    size = largest_of_samples(x)
+    size = jnp.max(jnp.abs(x), axis=2)
     to_unit, to_size = _scales(size)
     mean = to_size * (jnp.sum(x * to_unit[:, :, None], axis=2) / divisor)
     # Deviations in a second pass avoid cancellation. Their own mean, which would be zero
     # without rounding, is the correction of the mean.
     deviations = jnp.where(is_used, x - mean[:, :, None], 0)
-    largest = largest_of_samples(deviations)
+    largest = jnp.max(jnp.abs(deviations), axis=2)
     deviations_to_unit, to_deviations = _scales(largest)
     scaled = deviations * deviations_to_unit[:, :, None]
     scaled_correction = jnp.sum(scaled, axis=2) / divisor
     # The sum of squared deviations from the corrected mean.
     scaled_squares = jnp.sum(scaled**2, axis=2) - divisor * scaled_correction**2
-    return dict(
-        mean=mean,
-        mean_correction=to_deviations * scaled_correction,
-        norm=to_deviations * jnp.sqrt(jnp.maximum(scaled_squares, 0)),
-        largest=largest,
-        size=size,
-    )
+    mean_correction = to_deviations * scaled_correction
+    norm = to_deviations * jnp.sqrt(jnp.maximum(scaled_squares, 0))
+    return mean, mean_correction, norm, largest, size
 
 
 def _scales(size: Array) -> tuple[Array, Array]:

@@ -1,7 +1,7 @@
 """Arguments that `expectation` and `monte_carlo` have in common."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -14,19 +14,6 @@ from .estimate import Expectation
 from .sampling import MOST_SAMPLES
 
 
-class CheckedCall(NamedTuple):
-    """Arguments that are known to be valid.
-
-    - `key`: as a typed key.
-    - `first`: the number of the first sample.
-    - `devices`: the devices that share the work.
-    """
-
-    key: PRNGKeyArray
-    first: int
-    devices: Devices
-
-
 def checked_call(
     function_name: str,
     key: Any,
@@ -35,10 +22,11 @@ def checked_call(
     first: Any = 0,
     devices: Sequence[Any] | None = None,
     other_arguments: Any = (),
-) -> CheckedCall:
-    """The arguments, with defaults in place of `None`. Raises a `ValueError` for invalid
-    ones, and for traced arrays in `key` and in `other_arguments`. `function_name` is the
-    function that the user called, for messages."""
+) -> tuple[PRNGKeyArray, int, Devices]:
+    """The key as a typed key, the number of the first sample, and the devices, all of them
+    in place of `None`. Raises a `ValueError` for invalid arguments, and for traced arrays
+    in `key` and in `other_arguments`. `function_name` is the function that the user called,
+    for messages."""
     key = checked_key(function_name, key, other_arguments)
     if start is not None and first != 0:
         raise ValueError(
@@ -62,4 +50,4 @@ def checked_call(
         )
     if len(set(devices)) < len(devices):
         raise ValueError(f"`devices` must differ; got {devices!r}.")
-    return CheckedCall(key, first, tuple(devices))
+    return key, first, tuple(devices)

@@ -1,7 +1,7 @@
 """What `expectation` chooses: the law of the increments, the sampling, and its plan."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.random as jr
 import numpy as np
@@ -57,124 +57,76 @@ _PATHS_OF_TRIAL = 2**14
 _MOST_WORDS = 2**8
 
 
-class Request(NamedTuple):
-    """How the user of `expectation` wants it to be computed.
-
-    - `has_path`: whether the `terms` hold paths, rather than their shapes.
-    - The others are the arguments of the same names.
-    """
-
-    has_path: bool
-    key: PRNGKeyArray
-    sampling: AbstractSampling | None
-    tol: float | None
-    start: Expectation | None
-    engine: str | None
-    devices: Devices
-
-
-class Decision(NamedTuple):
-    """What is computed, and how. The plan holds the reason."""
-
-    problem: Problem
-    sampling: AbstractSampling
-    plan: SamplingPlan
-
-
-def choose(problem_for: Callable[[Want], Problem], request: Request) -> Decision:
+def choose(
+    problem_for: Callable[[Want], Problem],
+    has_path: bool,
+    key: PRNGKeyArray,
+    sampling: AbstractSampling | None,
+    tol: float | None,
+    start: Expectation | None,
+    engine: str | None,
+    devices: Devices,
+) -> tuple[Problem, AbstractSampling, SamplingPlan]:
     """Chooses the law of the increments and the sampling, as far as the user did not.
     `docs/expectation.md` states the rules. `problem_for` maps a purpose ("weak" or
     "strong"), for which the solver makes the paths that the user left open, to the
-    problem."""
-    engine = request.engine
+    problem. `has_path` is whether the `terms` hold paths, rather than their shapes. The
+    others are the arguments of `expectation`. Returns what is computed, and how: the plan
+    holds the reason."""
     if engine not in (None, "jax", "drjit"):
         raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
-    start = request.start
-    given = request.sampling
-    if given is None and start is not None:
-        given = start.sampling
+    if sampling is None and start is not None:
+        sampling = start.sampling
 
-    problem, why_law = _problem_and_reason(problem_for, given, request.has_path)
-    if given is None:
-        sampling, plan, why_sampling = _best_sampling(problem, request)
-    else:
-        sampling = _checked_sampling(given, start)
-        plan = _plan_for(problem, sampling, request)
-        why_sampling = ""
-    reason = "; ".join(filter(None, [why_sampling, why_law, plan.reason]))
-    plan = plan._replace(
-        reason=reason if start is None else start.reason,
-        rounding_floor=problem.finest_steps,
-        digests=problem.digests,
-    )
-    if start is not None and request.tol is None and plan.num_samples == _MOST_SAMPLES:
-        # `start` had a tolerance, and this call has none: it takes no further samples.
-        num_taken = start.moments[-1].end - start.moments[0].begin
-        plan = plan._replace(num_samples=num_taken)
-    return Decision(problem, sampling, plan)
-
-
-def _plan_for(
-    problem: Problem, sampling: AbstractSampling, request: Request
-) -> SamplingPlan:
-    """The plan of a sampling, for the engine that the user wants."""
-    if request.engine == "drjit":
-        return fused_plan(problem, request.key, sampling, request.devices)
-    return sampling.prepare(problem, trial_key(request.key), request.devices)
-
-
-class _Best(NamedTuple):
-    """The sampling that suits a problem best, its plan, and the reason."""
-
-    sampling: AbstractSampling
-    plan: SamplingPlan
-    reason: str
-
-
-def _best_sampling(problem: Problem, request: Request) -> _Best:
-    """The sampling that suits a problem best, by its sizes and by trials of a fit."""
-    tol = request.tol
-    sampling, reason = sampling_for(problem, tol, request.engine)
-    plan = _plan_for(problem, sampling, request)
-    # The remainder is zero except for value functions.
-    if plan.remainder > _MOST_REMAINDER:
-        sorted_sampling = array_rqmc_for(problem, tol)
-        if sorted_sampling is not None:
-            sampling = sorted_sampling
-            reason = (
-                "sorted paths, since fitted value functions leave "
-                f"{plan.remainder:.1%} of the standard error"
-            )
-            plan = _plan_for(problem, sampling, request)
-    if isinstance(sampling, ValueFunctions):
-        # A path with a control variate takes far longer than another, so none is taken in
-        # vain.
-        least = int(plan.num_samples * _FRACTION_BESIDE_STEPS)
-        plan = plan._replace(least_beside_steps=least)
-    if isinstance(sampling, ArrayRQMC) and tol is None:
-        # Compiling takes longer than so few paths, which then take up to 1.3 times as long.
-        # First calls of five problems took 17, 18, 23, 24 and 27 s of processor time, in
-        # place of 20, 21, 27, 27 and 26.
-        plan = plan._replace(is_quick=True)
-    return _Best(sampling, plan, reason)
-
-
-def _problem_and_reason(
-    problem_for: Callable[[Want], Problem],
-    sampling: AbstractSampling | None,
-    has_path: bool,
-) -> tuple[Problem, str]:
-    """The problem, and the reason for the law of its increments if that is not the usual
-    one. Increments are discrete, unless `phi` may not be smooth and the user left the law
-    open."""
     problem = problem_for("weak")
+    why_law = ""
     # Value functions need discrete increments, as do solvers of the weak sense.
     needs_discrete = isinstance(sampling, ValueFunctions)
     needs_discrete |= has_discrete_increments(problem.solver)
     if has_kinks(problem) and not has_path and not needs_discrete:
-        reason = "Gaussian increments, since phi may not be smooth"
-        return problem_for("strong"), reason
-    return problem, ""
+        problem = problem_for("strong")
+        why_law = "Gaussian increments, since phi may not be smooth"
+
+    def plan_for(sampling: AbstractSampling) -> SamplingPlan:
+        if engine == "drjit":
+            return fused_plan(problem, key, sampling, devices)
+        return sampling.prepare(problem, trial_key(key), devices)
+
+    why_sampling = ""
+    if sampling is not None:
+        _check_sampling(sampling, start)
+        plan = plan_for(sampling)
+    else:
+        sampling, why_sampling = sampling_for(problem, tol, engine)
+        plan = plan_for(sampling)
+        sorted_sampling = None
+        # The remainder is zero except for value functions.
+        if plan.remainder > _MOST_REMAINDER:
+            sorted_sampling = array_rqmc_for(problem, tol)
+        if sorted_sampling is not None:
+            sampling = sorted_sampling
+            why_sampling = (
+                "sorted paths, since fitted value functions leave "
+                f"{plan.remainder:.1%} of the standard error"
+            )
+            plan = plan_for(sampling)
+        if isinstance(sampling, ValueFunctions):
+            # A path with a control variate takes far longer than another, so none is taken
+            # in vain.
+            least = int(plan.num_samples * _FRACTION_BESIDE_STEPS)
+            plan = plan._replace(least_beside_steps=least)
+        if isinstance(sampling, ArrayRQMC) and tol is None:
+            # Compiling takes longer than so few paths, which then take up to 1.3 times as
+            # long. First calls of five problems took 17, 18, 23, 24 and 27 s of processor
+            # time, in place of 20, 21, 27, 27 and 26.
+            plan = plan._replace(is_quick=True)
+    reason = "; ".join(filter(None, [why_sampling, why_law, plan.reason]))
+    plan = plan._replace(reason=reason)
+    if start is not None and tol is None and plan.num_samples == _MOST_SAMPLES:
+        # `start` had a tolerance, and this call has none: it takes no further samples.
+        num_taken = start.moments[-1].end - start.moments[0].begin
+        plan = plan._replace(num_samples=num_taken)
+    return problem, sampling, plan
 
 
 def trial_key(key: PRNGKeyArray) -> PRNGKeyArray:
@@ -182,9 +134,9 @@ def trial_key(key: PRNGKeyArray) -> PRNGKeyArray:
     return jr.fold_in(key, _TRIAL_KEY)
 
 
-def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampling:
-    """The sampling itself. Raises a `ValueError` if it is not a sampling, or if `start` was
-    sampled by one of another class."""
+def _check_sampling(sampling: Any, start: Expectation | None) -> None:
+    """Raises a `ValueError` if this is not a sampling, or if `start` was sampled by one of
+    another class."""
     if not isinstance(sampling, AbstractSampling):
         names = ", ".join(f"`{name}`" for name in SAVED_SAMPLINGS)
         raise ValueError(
@@ -196,40 +148,38 @@ def _checked_sampling(sampling: Any, start: Expectation | None) -> AbstractSampl
             f"`start` was sampled by {start.sampling}; got sampling={sampling}. Pass the "
             "same `sampling`."
         )
-    return sampling
 
 
 def sampling_for(
     problem: Problem, tol: float | None, engine: str | None = None
 ) -> tuple[AbstractSampling, str]:
     """The sampling that suits a problem best, and the reason for this choice."""
-    if engine == "drjit":
-        # This engine takes independent paths only, so there is nothing to choose.
-        return _independent_sampling(problem, tol), ""
-    num_outcomes = count_outcomes(problem)
-    num_steps = _num_steps(problem)
-    size = f"{problem.num_components} components of the state, {num_steps:,} steps"
-    if num_outcomes:
-        size += f" of {num_outcomes} outcomes each"
-    # Value functions leave the variance of random starts, for which their few paths do not
-    # suffice. With a tolerance, levels are added until a fit takes far longer.
-    is_random_by_noise = bool(num_outcomes) and not problem.paths_differ
-    if is_random_by_noise and suits_grid(problem, may_take_long=tol is not None):
-        sampling = ValueFunctions(num_paths=_MOST_SAMPLES) if tol else ValueFunctions()
-        return sampling, f"value functions for {size}"
-    sampling = array_rqmc_for(problem, tol)
-    if sampling is not None:
-        return sampling, f"sorted paths for {size}"
-    return _independent_sampling(problem, tol), f"independent paths for {size}"
-
-
-def _independent_sampling(problem: Problem, tol: float | None) -> IndependentPaths:
-    """As many independent paths as there is time for, or with `tol` as many as it takes."""
-    if tol:
-        return IndependentPaths(_MOST_SAMPLES)
-    num_affordable = _affordable_operations(problem) / operations_per_step(problem)
-    num_paths = np.clip(num_affordable, _FEWEST_PATHS, _MOST_INDEPENDENT_PATHS)
-    return IndependentPaths(int(num_paths))
+    reason = ""
+    # The engine "drjit" takes independent paths only, so there is nothing to choose.
+    if engine != "drjit":
+        num_outcomes = count_outcomes(problem)
+        size = f"{problem.num_components} components of the state, "
+        size += f"{_num_steps(problem):,} steps"
+        if num_outcomes:
+            size += f" of {num_outcomes} outcomes each"
+        # Value functions leave the variance of random starts, for which their few paths do
+        # not suffice. With a tolerance, levels are added until a fit takes far longer.
+        is_random_by_noise = bool(num_outcomes) and not problem.paths_differ
+        if is_random_by_noise and suits_grid(problem, may_take_long=tol is not None):
+            sampling = ValueFunctions()
+            if tol is not None:
+                sampling = ValueFunctions(num_paths=_MOST_SAMPLES)
+            return sampling, f"value functions for {size}"
+        sampling = array_rqmc_for(problem, tol)
+        if sampling is not None:
+            return sampling, f"sorted paths for {size}"
+        reason = f"independent paths for {size}"
+    # As many as there is time for, or with `tol` as many as it takes.
+    num_paths = _MOST_SAMPLES
+    if tol is None:
+        num_affordable = _affordable_operations(problem) / operations_per_step(problem)
+        num_paths = np.clip(num_affordable, _FEWEST_PATHS, _MOST_INDEPENDENT_PATHS)
+    return IndependentPaths(int(num_paths)), reason
 
 
 def array_rqmc_for(problem: Problem, tol: float | None) -> ArrayRQMC | None:

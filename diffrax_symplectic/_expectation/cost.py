@@ -92,9 +92,15 @@ def _operations_of(eqn: Any) -> int:
     name = eqn.primitive.name
     inner_programs = programs_in(eqn)
     if inner_programs:
+        passes = 1
+        if name == "scan":
+            passes = eqn.params["length"]
+        # A loop around another one runs it again only if it has not finished, which is
+        # rare, so it counts as one pass.
+        elif name == "while" and not any(map(_has_loop, inner_programs)):
+            passes = _PASSES
         # In a batch all branches of a conditional are evaluated.
-        count = sum(map(_count_operations, inner_programs))
-        return _passes(eqn) * count
+        return passes * sum(map(_count_operations, inner_programs))
     if name in LAPACK:
         return _COST_OF_LAPACK
     if name.startswith("reduce_"):
@@ -102,34 +108,18 @@ def _operations_of(eqn: Any) -> int:
     if name.startswith("scatter"):
         return _COST_OF_SCATTER * _size(eqn.invars[-1])
     size = sum(map(_size, eqn.outvars))
-    is_complex = any(map(_is_complex, eqn.outvars))
+    is_complex = any(
+        jnp.issubdtype(x.aval.dtype, jnp.complexfloating) for x in eqn.outvars
+    )
+    cost_of_number = _COMPLEX_PER_REAL if is_complex else 1
     if name == "dot_general":
-        return _operations_of_product(eqn, size, is_complex)
-    cost = _COST_BY_NAME.get(name, 1)
-    return cost * size * (_COMPLEX_PER_REAL if is_complex else 1)
-
-
-def _operations_of_product(eqn: Any, size: int, is_complex: bool) -> int:
-    """`_operations_of` a product of matrices or vectors whose result has `size` entries,
-    each of them a sum over the contracted axes."""
-    (contracted_axes, _), _ = eqn.params["dimension_numbers"]
-    first_factor, _ = eqn.invars
-    shape = first_factor.aval.shape
-    num_products = size * math.prod(shape[axis] for axis in contracted_axes)
-    if is_complex:
-        return _COST_OF_COMPLEX_PRODUCT + _COMPLEX_PER_REAL * num_products
-    return _COST_OF_PRODUCT + num_products
-
-
-def _passes(eqn: Any) -> int:
-    """How often the programs in an operation run."""
-    if eqn.primitive.name == "scan":
-        return eqn.params["length"]
-    # A loop around another one runs it again only if it has not finished, which is rare, so
-    # it counts as one pass.
-    if eqn.primitive.name == "while" and not any(map(_has_loop, programs_in(eqn))):
-        return _PASSES
-    return 1
+        # Each entry of the result is a sum over the contracted axes.
+        (contracted_axes, _), _ = eqn.params["dimension_numbers"]
+        shape = eqn.invars[0].aval.shape
+        num_products = size * math.prod(shape[axis] for axis in contracted_axes)
+        cost = _COST_OF_COMPLEX_PRODUCT if is_complex else _COST_OF_PRODUCT
+        return cost + cost_of_number * num_products
+    return _COST_BY_NAME.get(name, 1) * size * cost_of_number
 
 
 def _has_loop(jaxpr: Jaxpr) -> bool:
@@ -142,7 +132,3 @@ def _has_loop(jaxpr: Jaxpr) -> bool:
 
 def _size(variable: Any) -> int:
     return math.prod(variable.aval.shape)
-
-
-def _is_complex(variable: Any) -> bool:
-    return jnp.issubdtype(variable.aval.dtype, jnp.complexfloating)

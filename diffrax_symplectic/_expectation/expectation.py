@@ -4,7 +4,7 @@ import dataclasses
 import functools as ft
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import numpy as np
@@ -28,7 +28,7 @@ from .._terms import (
     with_paths,
 )
 from .call import checked_call
-from .choose import choose, Decision, Request, trial_key, trial_sampling
+from .choose import choose, trial_key, trial_sampling
 from .estimate import (
     cautions,
     Expectation,
@@ -203,7 +203,6 @@ def expectation(
         levels = _FEWEST_LEVELS if start is None else start.levels
 
     has_shape = any(isinstance(path, UnspecifiedPath) for path in brownian_paths(terms))
-    request = Request(not has_shape, key, sampling, tol, start, engine, devices)
     problem_of = ft.partial(
         Problem.of, phi, terms, solver, t0, t1, dt0, y0, args, ts, key=key
     )
@@ -213,12 +212,17 @@ def expectation(
     with ShortTraceback(), Kept() as kept, progress:
         while True:
             progress.stage("preparing the samples")
-            decision = choose(ft.partial(problem_of, levels), request)
-            problem, used_sampling, plan = decision
+            problem, used_sampling, plan = choose(
+                ft.partial(problem_of, levels), not has_shape, key, sampling, tol,
+                start, engine, devices,
+            )  # fmt: skip
             progress.stage(f"compiling and sampling with {levels} step sizes")
             estimate = run(
-                plan, key, devices, used_sampling, start, first, tol, progress, times,
-                kept,
+                plan, key, devices, start, first, tol, progress, kept,
+                sampling=used_sampling,
+                rounding_floor=problem.finest_steps,
+                digests=problem.digests,
+                ts=times,
             )  # fmt: skip
             if tol is None or not may_add_levels or levels == _MOST_LEVELS:
                 break
@@ -227,7 +231,8 @@ def expectation(
             levels += 1
 
         progress.stage("checking the steps")
-        for message in _messages_on_result(estimate, problem, tol, float(dt0)):
+        dt0 = float(dt0)
+        for message in _messages_on_result(estimate, problem, tol, dt0):
             warnings.warn(message, stacklevel=2)
         paths = plan.simulate_paths
         if isinstance(paths, FusedPaths):
@@ -237,11 +242,23 @@ def expectation(
         # Warnings of the problem come with its first samples, and not again with later
         # parts.
         if start is None and first == 0:
-            checked = _checked(estimate, decision, key, devices, float(dt0))
-            for message in checked.messages:
+            messages: list[str | None] = [
+                *messages_on_steps(problem.with_any_steps(), dt0)
+            ]
+            # A trial takes longer than these looks, which name the cause.
+            if levels == 2 and not messages:
+                message, caveat = trial_with_finer_level(
+                    estimate, problem, plan, key, devices
+                )
+                messages.append(message)
+                estimate = dataclasses.replace(estimate, caveat=caveat)
+            if has_kinks(problem):
+                messages.append(
+                    _message_on_discrete_increments(estimate, problem, key, devices)
+                )
+            for message in filter(None, messages):
                 warnings.warn(message, stacklevel=2)
-            warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
-            estimate = dataclasses.replace(estimate, caveat=checked.caveat)
+            warn_of_truncation(problem.terms, dt0, stacklevel=2)
     return estimate
 
 
@@ -256,62 +273,20 @@ def _messages_on_result(
     if lost_numbers is not None and most_fail:
         return [*cautions(estimate, tol, advice=lost_numbers)]
     advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
-    if most_fail:
-        advice = _advice_on_long_steps(problem, dt0) + advice
+    any_steps = problem.with_any_steps()
+    if most_fail and may_be_too_long(any_steps):
+        shorter = dt0 / max(4, unresolved_angle(any_steps) or 0)
+        advice = (
+            f"Most likely, steps of `dt0={dt0:g}` are too long for "
+            f"`{type(problem.solver).__name__}`: pass `dt0={shorter:.2g}` or less, or an "
+            f"implicit solver. {advice}"
+        )
     messages = [
         *cautions(estimate, tol, advice),
         lost_numbers,
         _message_on_rounding(estimate, problem),
     ]
     return [message for message in messages if message is not None]
-
-
-def _advice_on_long_steps(problem: Problem, dt0: float) -> str:
-    """Which steps to take where most paths fail because they are too long; empty if they
-    are not."""
-    any_steps = problem.with_any_steps()
-    if not may_be_too_long(any_steps):
-        return ""
-    shorter = dt0 / max(4, unresolved_angle(any_steps) or 0)
-    return (
-        f"Most likely, steps of `dt0={dt0:g}` are too long for "
-        f"`{type(problem.solver).__name__}`: pass `dt0={shorter:.2g}` or less, or an "
-        "implicit solver. "
-    )
-
-
-class _Checked(NamedTuple):
-    """What checks of a problem found.
-
-    - `messages`: what is wrong, as sentences.
-    - `caveat`: that of an `Expectation`.
-    """
-
-    messages: list[str]
-    caveat: str
-
-
-def _checked(
-    estimate: Expectation,
-    decision: Decision,
-    key: PRNGKeyArray,
-    devices: Devices,
-    dt0: float,
-) -> _Checked:
-    """What is wrong with the steps, and with discrete increments, by looks at the problem
-    and by trials."""
-    problem, _, plan = decision
-    messages = messages_on_steps(problem.with_any_steps(), dt0)
-    caveat = ""
-    # A trial takes longer than these looks, which name the cause.
-    if estimate.levels == 2 and not messages:
-        trial = trial_with_finer_level(estimate, problem, plan, key, devices)
-        caveat = trial.caveat
-        if trial.message is not None:
-            messages.append(trial.message)
-    if has_kinks(problem):
-        messages += _messages_on_discrete_increments(estimate, problem, key, devices)
-    return _Checked(messages, caveat)
 
 
 def messages_on_steps(problem: Problem, dt0: float) -> list[str]:
@@ -334,54 +309,43 @@ def messages_on_steps(problem: Problem, dt0: float) -> list[str]:
     return [message for message in found if message is not None]
 
 
-def _messages_on_discrete_increments(
+def _message_on_discrete_increments(
     estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: Devices
-) -> list[str]:
+) -> str | None:
     """What is wrong with the mean of a `phi` that may not be smooth if increments are
-    discrete, as a list of one sentence or none. A trial with Gaussian increments shows it,
-    or without a trial, that the solver takes discrete increments only."""
+    discrete, as a sentence; `None` if nothing is. A trial with Gaussian increments shows
+    it, or without a trial, that the solver takes discrete increments only."""
     paths = random_paths(problem.terms)
     laws = [law for path in paths for law in (laws_of(path) or {}).values()]
     if not any(isinstance(law, Discrete) for law in laws):
-        return []
+        return None
     if has_discrete_increments(problem.solver):
-        return [
+        return (
             f"`phi` may not be smooth, and `{type(problem.solver).__name__}` has discrete "
             "increments alone, which have the right means of smooth functions only. Pass "
             'a solver of `suggest_solver(terms, t0, y0, args, want="strong")`.'
-        ]
-    trial = _trial_with_gaussian_increments(problem, key, devices)
-
+        )
+    # Paths that are one Brownian motion become one again.
+    gaussian_path = ft.partial(own_path, problem.solver, "strong")
+    terms = with_paths(gaussian_path, motion_numbers(paths), problem.terms, key)
+    gaussian_problem = dataclasses.replace(problem, terms=terms)
+    key_of_trial = trial_key(key)
+    sampling = trial_sampling(gaussian_problem)
+    plan = sampling.prepare(gaussian_problem, key_of_trial, devices)
+    of_trial = run(plan, key_of_trial, devices).vectors
     of_estimate = estimate.vectors
-    of_trial = trial.vectors
     changes = np.abs(of_estimate.mean - of_trial.mean)
     std_errors = np.hypot(of_estimate.std_error, of_trial.std_error)
     if not np.any(changes > _STD_ERRORS_TO_BE_SURE * std_errors):
-        return []
-    return [
+        return None
+    return (
         "`phi` is not smooth, and its mean changes by up to "
         f"{largest_error(changes):.1e} with Gaussian increments, which is more than the "
         "error of the estimate: the discrete increments of a `WeakBrownianPath` (and of "
         "`ValueFunctions`) are for smooth functions. Pass the shape in place of the path "
         "in `terms`, or a `FixedStepBrownianPath`, and another `sampling` than "
         "`ValueFunctions`."
-    ]
-
-
-def _trial_with_gaussian_increments(
-    problem: Problem, key: PRNGKeyArray, devices: Devices
-) -> Expectation:
-    """An estimate of the same mean, with Gaussian increments in place of those of `terms`,
-    for a solver that takes them. `key` is that of the call."""
-    # Paths that are one Brownian motion become one again.
-    motions = motion_numbers(random_paths(problem.terms))
-    make_gaussian_path = ft.partial(own_path, problem.solver, "strong")
-    terms = with_paths(make_gaussian_path, motions, problem.terms, key)
-    gaussian_problem = dataclasses.replace(problem, terms=terms)
-    sampling = trial_sampling(gaussian_problem)
-    key_of_trial = trial_key(key)
-    plan = sampling.prepare(gaussian_problem, key_of_trial, devices)
-    return run(plan, key_of_trial, devices)
+    )
 
 
 def _message_on_rounding(estimate: Expectation, problem: Problem) -> str | None:

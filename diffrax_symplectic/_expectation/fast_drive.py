@@ -1,5 +1,7 @@
 """Whether forces or noise change in time too fast for the steps."""
 
+import functools as ft
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,12 +50,11 @@ def unresolved_drive(problem: Problem) -> str | None:
     # those of one path meets those of another, so levels do not agree on a wrong mean.
     if problem.args_of is not None:
         return None
-    field = all_fields(problem, problem.args)
-    if not depends_on_time(field, problem, problem.y0):
+    field = all_fields(problem)
+    if not depends_on_time(field, problem.t0, problem.y0):
         return None
     h = float(problem.levels.h[-1])
-    size = problem.num_components
-    most_times = min(_MOST_TIMES, _MOST_NUMBERS // max(size, 1))
+    most_times = min(_MOST_TIMES, _MOST_NUMBERS // max(problem.num_components, 1))
     most_steps = max(_FEWEST_STEPS, most_times // _FEWEST_TIMES_IN_STEP)
     step_numbers = np.arange(problem.finest_steps)
     if len(step_numbers) > most_steps:
@@ -64,7 +65,7 @@ def unresolved_drive(problem: Problem) -> str | None:
     fractions = np.sort(spread_evenly(times_in_step + 1)[1:])
     # (steps, times)
     times = float(problem.t0) + h * (step_numbers[:, None] + fractions)
-    departure = _quick_departure(field, problem.y0, times.astype(problem.dtype))
+    departure = _departure(field, problem.y0, times.astype(problem.dtype))
     if not float(departure) > _MOST_DEPARTURE:
         return None
     return (
@@ -75,6 +76,7 @@ def unresolved_drive(problem: Problem) -> str | None:
     )
 
 
+@ft.partial(compiled, quickly=True)
 def _departure(
     field: Field, y0: Y, times: Float[Array, "steps times"]
 ) -> Float[Array, ""]:
@@ -95,6 +97,3 @@ def _departure(
     from_line, from_mean, of_field = jnp.sum(lax.map(squares, times), axis=0)
     is_small = from_mean <= _SMALL_CHANGE**2 * of_field
     return jnp.where(is_small, 0, jnp.sqrt(from_line / from_mean))
-
-
-_quick_departure = compiled(_departure, quickly=True)

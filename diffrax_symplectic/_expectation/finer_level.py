@@ -51,26 +51,16 @@ _STD_ERRORS_TO_BE_SURE = 3
 _LARGEST_SHARE_FAILED = 0.1
 
 
-class Trial(NamedTuple):
-    """What a trial with a finer level tells.
-
-    - `message`: how it changes a mean by more than its error; `None` if it does not.
-    - `caveat`: which changes the trial could not see, in words; empty if these are less
-        than the error.
-    """
-
-    message: str | None = None
-    caveat: str = ""
-
-
 def trial_with_finer_level(
     estimate: Expectation,
     problem: Problem,
     plan: SamplingPlan,
     key: PRNGKeyArray,
     devices: Devices,
-) -> Trial:
-    """Whether a finer level changes an estimate of two levels by more than its error.
+) -> tuple[str | None, str]:
+    """How a finer level changes an estimate of two levels by more than its error, as a
+    sentence (`None` if it does not); and which changes the trial could not see, in words
+    (empty if these are less than the error).
 
     Two levels agree on a wrong mean where both miss what happens in shorter times, such as
     a rotation, a close encounter or a decay, and by chance where phases are lost.
@@ -83,29 +73,41 @@ def trial_with_finer_level(
     paths whose steps may miss a rotation get the first kind all the same, since a change of
     less than ten errors would remain possible.)"""
     if any(map(has_unknown_law, brownian_paths(problem.terms))):
-        return Trial()
+        return None, ""
     key = trial_key(key)
     is_fitted = isinstance(estimate.sampling, ValueFunctions)
     angle = unresolved_angle(problem.with_any_steps())
-    has_same_sampling = plan.with_halved_steps is not None and (
-        is_fitted or angle is None
-    )
-    if has_same_sampling:
+    if plan.with_halved_steps is not None and (is_fitted or angle is None):
         changes = _changes_by_same_sampling(estimate, plan, key, devices)
     else:
         changes = _changes_on_same_noise(estimate, problem, key, devices)
     if changes is None:
-        return Trial()
+        return None, ""
+    h = problem.levels.h
+    advice = "Pass a smaller `dt0`, or `levels=3`, which checks the order."
     if changes.are_sure:
-        h = float(problem.levels.h[-1]) / 2
-        return Trial(message=_message(estimate, changes, h))
+        worst = int(np.argmax(changes.excess))
+        message = (
+            f"Steps are too long: on {changes.num_paths} paths of a trial, a third level, "
+            f"with steps of {float(h[-1]) / 2:.3g}, changes a mean"
+            f"{label_of(estimate, worst)} by {changes.sizes[worst]:.2g} ± "
+            f"{changes.std_errors[worst]:.1g}, which is more than its error, "
+            f"{changes.errors[worst]:.1g}. {advice}"
+        )
+        return message, ""
     # Next to value functions the standard error of fewer samples is always the larger one,
     # which says little of resolved steps.
     if is_fitted or not changes.are_hidden:
-        return Trial()
+        return None, ""
+    caveat = _caveat(estimate, changes)
     if angle is None:
-        return Trial(caveat=_caveat(estimate, changes))
-    return Trial(message=_message_on_chance(estimate, problem, changes, angle))
+        return None, caveat
+    message = (
+        f"Steps of `dt0={float(h[0]):g}` are long, omega h = {angle:.3g} for the largest "
+        "frequency of the drift where paths start, and two levels may agree on a wrong "
+        f"mean by chance: {caveat}, which is more than the error. {advice}"
+    )
+    return message, ""
 
 
 class _Changes(NamedTuple):
@@ -147,29 +149,6 @@ class _Changes(NamedTuple):
         return bool(np.any(self.visible > self.errors))
 
 
-def _message(estimate: Expectation, changes: _Changes, h: float) -> str:
-    worst = int(np.argmax(changes.excess))
-    return (
-        f"Steps are too long: on {changes.num_paths} paths of a trial, a third level, with "
-        f"steps of {h:.3g}, changes a mean{label_of(estimate, worst)} by "
-        f"{changes.sizes[worst]:.2g} ± {changes.std_errors[worst]:.1g}, which is more "
-        f"than its error, {changes.errors[worst]:.1g}. Pass a smaller `dt0`, or "
-        "`levels=3`, which checks the order."
-    )
-
-
-def _message_on_chance(
-    estimate: Expectation, problem: Problem, changes: _Changes, angle: float
-) -> str:
-    caveat = _caveat(estimate, changes)
-    return (
-        f"Steps of `dt0={float(problem.levels.h[0]):g}` are long, omega h = {angle:.3g} "
-        "for the largest frequency of the drift where paths start, and two levels may "
-        f"agree on a wrong mean by chance: {caveat}, which is more than the error. Pass a "
-        "smaller `dt0`, or `levels=3`, which checks the order."
-    )
-
-
 def _caveat(estimate: Expectation, changes: _Changes) -> str:
     worst = int(np.argmax(changes.visible / changes.errors))
     return (
@@ -184,12 +163,27 @@ def _changes_on_same_noise(
     """The changes on independent paths, more and more of them until the changes are sure,
     or known well enough to be less than the errors. `None` if the estimate has too few
     paths for a trial, or too many paths of the trial fail."""
+    first, *others = _PATHS_OF_TRIALS
+    # All trials take as many paths at once as the first one, so that they share a program;
+    # or fewer if the user chose a smaller batch, as to save memory.
+    batch_size = first
+    sampling = estimate.sampling
+    if isinstance(sampling, IndependentPaths) and sampling.batch_size is not None:
+        batch_size = min(first, int(sampling.batch_size))
+    # A fit takes far longer than the largest trial.
+    if not isinstance(sampling, ValueFunctions):
+        first = min(first, int(_SHARE_OF_FIRST_TRIAL * estimate.num_paths))
+        most = _SHARE_OF_LATER_TRIALS * estimate.num_paths
+        others = [num_paths for num_paths in others if num_paths <= most]
+    if first < _FEWEST_PATHS:
+        return None
     finer_problem = _with_finer_level(problem, key)
     trial = None
     changes = None
-    for num_paths in _trial_sizes(estimate):
-        sampling = IndependentPaths(num_paths, _batch_size(estimate))
-        plan = sampling.prepare(finer_problem, key, devices)
+    for num_paths in (first, *others):
+        plan = IndependentPaths(num_paths, batch_size).prepare(
+            finer_problem, key, devices
+        )
         trial = run(plan._replace(is_quick=True), key, devices, start=trial)
         if trial.num_failed > _LARGEST_SHARE_FAILED * num_paths:
             return None
@@ -235,29 +229,6 @@ def _changes_by_same_sampling(
         errors=of_estimate.error,
         num_paths=trial.num_paths,
     )
-
-
-def _trial_sizes(estimate: Expectation) -> list[int]:
-    """The numbers of paths to try in turn; none if even the first would be too small."""
-    # A fit takes far longer than the largest trial.
-    if isinstance(estimate.sampling, ValueFunctions):
-        return list(_PATHS_OF_TRIALS)
-    first, *others = _PATHS_OF_TRIALS
-    first = min(first, int(_SHARE_OF_FIRST_TRIAL * estimate.num_paths))
-    if first < _FEWEST_PATHS:
-        return []
-    most = _SHARE_OF_LATER_TRIALS * estimate.num_paths
-    return [first] + [num_paths for num_paths in others if num_paths <= most]
-
-
-def _batch_size(estimate: Expectation) -> int:
-    """The paths that trials take at once: as many as the first trial has, so that all share
-    a program, or fewer if the user chose a smaller batch, as to save memory."""
-    largest = _PATHS_OF_TRIALS[0]
-    sampling = estimate.sampling
-    if isinstance(sampling, IndependentPaths) and sampling.batch_size is not None:
-        return min(largest, int(sampling.batch_size))
-    return largest
 
 
 def _with_finer_level(problem: Problem, key: PRNGKeyArray) -> Problem:

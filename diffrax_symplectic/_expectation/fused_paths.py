@@ -1,7 +1,7 @@
 """Samples of `expectation` from a fused kernel."""
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
 from .._custom_types import Devices
-from .._root_finder import all_finite
 from .._simulation import by_drjit, combinations, Level, Problem, state_itself
 from .independent import IndependentPaths
 from .sampling import Averaged, Outputs, Samples, SamplingPlan
@@ -63,8 +62,10 @@ class FusedPaths:
         self.num_failed = 0
         self.num_stragglers = 0
 
-    def __call__(self, first: int, num_samples: int) -> "_Paths":
-        """The paths of this number of samples, from sample number `first` on."""
+    def __call__(self, first: int, num_samples: int) -> tuple[PyTree, np.ndarray]:
+        """The paths of this number of samples, from sample number `first` on: their states
+        at the saved times, with axes for levels, paths and times, and which paths failed,
+        with axes for levels and paths."""
         sample_numbers = np.arange(first, first + num_samples, dtype=np.uint64)
         batches = [
             by_drjit(self._problem, self._key, sample_numbers, level)
@@ -73,35 +74,21 @@ class FusedPaths:
         self.num_paths += num_samples * len(batches)
         self.num_failed += sum(int(np.sum(batch.failed)) for batch in batches)
         self.num_stragglers += sum(batch.num_stragglers for batch in batches)
-        return _Paths(
-            y=jtu.tree_map(_stacked_levels, *[batch.y for batch in batches]),
-            failed=_stacked_levels(*[batch.failed for batch in batches]),
-        )
-
-
-def _stacked_levels(*levels: np.ndarray) -> np.ndarray:
-    return np.stack(levels)
-
-
-class _Paths(NamedTuple):
-    """Paths, along the second axis of each array. The first axis is the level.
-
-    - `y`: the states at the saved times, along the third axis.
-    - `failed`: which paths failed.
-    """
-
-    y: PyTree[Array | np.ndarray]
-    failed: Bool[Array | np.ndarray, "levels n"]
+        states_and_failed = [(batch.y, batch.failed) for batch in batches]
+        return jtu.tree_map(lambda *levels: np.stack(levels), *states_and_failed)
 
 
 def _samples_of_fused_paths(
-    problem: Problem, paths: _Paths, keys: Key[Array, " n"]
+    problem: Problem,
+    paths: tuple[PyTree[Array], Bool[Array, "levels n"]],
+    keys: Key[Array, " n"],
 ) -> Samples:
-    """The samples of paths that a kernel has simulated. From the key of a path its `args`
-    are drawn once more.
+    """The samples of paths that a kernel has simulated, as `FusedPaths` returns them. From
+    the key of a path its `args` are drawn once more.
 
     Axes are named as in `_simulation/problem.py`: `S` times, and `m` numbers of `phi` at
     each."""
+    states, failed = paths
     _, args_of_paths = jax.vmap(problem.draw_start)(keys)
 
     # `y` holds the states of a path at all times.
@@ -115,9 +102,8 @@ def _samples_of_fused_paths(
         return jax.vmap(values_of_path, (None, 0, 0))(times, y, args_of_paths)
 
     # (levels, n, S, m)
-    phi = jax.vmap(values_on_level)(problem.levels, paths.y)
-    is_finite = jax.vmap(jax.vmap(all_finite))(phi)
-    failed = jnp.asarray(paths.failed) | ~is_finite
+    phi = jax.vmap(values_on_level)(problem.levels, states)
+    failed = failed | ~jnp.all(jnp.isfinite(phi), axis=(2, 3))
     values = combinations(problem.weights, phi.reshape(*phi.shape[:2], -1))
     return Samples(
         averaged=Averaged(values),

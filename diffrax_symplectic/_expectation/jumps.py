@@ -1,5 +1,6 @@
 """Whether forces or noise jump in time, where two levels do not show what that does."""
 
+import functools as ft
 from typing import NamedTuple
 
 import jax
@@ -28,10 +29,10 @@ from .fields_in_time import (
     all_fields,
     at_both_states,
     depends_on_time,
-    drift_field,
+    drift_rate,
     Field,
-    force_field,
-    noise_field,
+    forces,
+    noise_change,
 )
 
 
@@ -52,42 +53,6 @@ _MOST_STEPS_SEARCHED = 256
 _PARTS_OF_STEP = 32
 
 
-class _Sides(NamedTuple):
-    """A vector field around a time, such as the end of a step.
-
-    - `far_before`, `far_after`: on both sides, as far away as smooth fields change little.
-    - `before`, `after`: on both sides, as near as the rounding of times allows.
-    """
-
-    far_before: Float[Array, " n"]
-    before: Float[Array, " n"]
-    after: Float[Array, " n"]
-    far_after: Float[Array, " n"]
-
-    @property
-    def largest_smooth_change(self) -> Float[Array, ""]:
-        """The largest change from `before` to `after` that does not count as a jump:
-        several times the changes on both sides, plus an allowance for rounding."""
-        change_before = jnp.linalg.norm(self.before - self.far_before)
-        change_after = jnp.linalg.norm(self.far_after - self.after)
-        size = jnp.linalg.norm(jnp.stack(self))
-        rounding = jnp.sqrt(jnp.finfo(size.dtype).eps) * size
-        return _JUMP_PER_SMOOTH_CHANGE * (change_before + change_after) + rounding
-
-
-class _Steps(NamedTuple):
-    """The shortest steps of a problem, as many as are looked at.
-
-    - `starts`, `h`: when they start, and how long they are.
-    - `near`, `far`: how far before and after a time the fields of `_Sides` are taken.
-    """
-
-    starts: Float[np.ndarray, " steps"]
-    h: float
-    near: float
-    far: float
-
-
 def jumps_within_steps(problem: Problem) -> str | None:
     """What is wrong with forces or noise that jump in time between the ends of the shortest
     steps, as a sentence; `None` if none do.
@@ -96,22 +61,19 @@ def jumps_within_steps(problem: Problem) -> str | None:
     the same end of a step, this error is the same on all of them, so that they agree. A
     jump whose time is random, with another one for each path, does not count: the errors
     of the paths average out."""
-    field = all_fields(problem, problem.args)
-    if not depends_on_time(field, problem, problem.y0):
+    if not depends_on_time(all_fields(problem), problem.t0, problem.y0):
         return None
     steps = _steps_to_look_at(problem)
     if steps is None:
         return None
-    times = _times_of_jumps(field, problem, steps)
+    times = _times_of_jumps(problem, steps)
     # Only jumps that another draw of `args` has, too, are at the same time on all paths.
     if problem.args_of is not None and times.size:
-        other_args = problem.with_args(problem.draw_start(jr.key(2)).args).args
-        other_field = all_fields(problem, other_args)
-        other_times = _times_of_jumps(other_field, problem, steps)
+        other_args = problem.draw_start(jr.key(2)).args
+        other_times = _times_of_jumps(problem.with_args(other_args), steps)
         # (jumps of one draw, jumps of the other)
         are_equal = np.abs(times[:, None] - other_times) < steps.far
-        is_in_both = np.any(are_equal, axis=1)
-        times = times[is_in_both]
+        times = times[np.any(are_equal, axis=1)]
     if not times.size:
         return None
     return (
@@ -131,70 +93,86 @@ def jumps_at_step_ends(problem: Problem) -> str | None:
     the mean converges with order 1. But two levels extrapolate by order 2, and find less
     than the error. The ends of the shortest steps include the middles of steps twice as
     long."""
-    solver = problem.solver
-    if isinstance(solver, AbstractLangevinSplitting):
-        if not solver.symmetric or not solver.kicks_at_ends:
-            return None
-        return _jumping_kicks(problem, solver)
-    if isinstance(solver, AbstractSymplecticRungeKutta):
-        return _jumping_stages(problem, solver)
+    y0 = problem.y0
+    if isinstance(problem.solver, AbstractLangevinSplitting):
+        _, y0 = momentum_first(problem.terms, y0)
+        fields = _kicks_at_ends(problem, problem.solver)
+        cure = "Let the function of time return the mean of both sides at a jump"
+        if not problem.solver.has_flow:
+            cure += (
+                ", or pass `BAOAB(ImplicitMidpoint())`, which takes forces within steps"
+            )
+    elif isinstance(problem.solver, AbstractSymplecticRungeKutta):
+        fields = _stages_at_ends(problem, problem.solver)
+        cure = (
+            "Pass a solver that takes forces and noise within steps, such as "
+            "`ImplicitMidpoint()`"
+        )
+    else:
+        return None
+    for what_happens, field in fields.items():
+        end = _first_jump_at_end(field, problem, y0)
+        if end is not None:
+            return (
+                f"The {what_happens} at step ends, such as t={end:.6g}, and "
+                f"`{type(problem.solver).__name__}` takes one side of the jump for both "
+                "steps: the mean converges to first order only, and two levels do not see "
+                f"it. {cure}."
+            )
     return None
 
 
-def _jumping_kicks(problem: Problem, solver: AbstractLangevinSplitting) -> str | None:
-    """`jumps_at_step_ends` for the forces of splittings that begin and end with a kick."""
-    terms, y0 = momentum_first(problem.terms, problem.y0)
+def _kicks_at_ends(
+    problem: Problem, solver: AbstractLangevinSplitting
+) -> dict[str, Field]:
+    """The forces of splittings that begin and end with a kick, by what they would do
+    there."""
+    if not solver.symmetric or not solver.kicks_at_ends:
+        return {}
+    terms, _ = momentum_first(problem.terms, problem.y0)
     drift, _, _ = split_friction(without_constraint(terms))
     kicks, _ = kicks_and_rest(solver.has_flow, drift)
-    if not kicks:
-        return None
-    end = _first_jump_at_end(force_field(kicks, problem.args), problem, y0)
-    if end is None:
-        return None
-    name = type(solver).__name__
-    other_cure = ""
-    if not solver.has_flow:
-        other_cure = (
-            ", or pass `BAOAB(ImplicitMidpoint())`, which takes forces within steps"
-        )
-    return (
-        f"The forces jump at step ends, such as t={end:.6g}, and `{name}` takes one side "
-        "of the jump for both steps: the mean converges to first order only, and two "
-        "levels do not see it. Let the function of time return the mean of both sides at "
-        f"a jump{other_cure}."
-    )
+    return {"forces jump": jtu.Partial(forces, kicks, problem.args)} if kicks else {}
 
 
-def _jumping_stages(
+def _stages_at_ends(
     problem: Problem, solver: AbstractSymplecticRungeKutta
-) -> str | None:
-    """`jumps_at_step_ends` for tableaus."""
+) -> dict[str, Field]:
+    """The fields that a tableau evaluates at ends of steps, by what they would do there."""
     # Two levels extrapolate by the weak order, or by 1 if there is none.
     if solver.weak_order(problem.terms) in (1, None):
-        return None
+        return {}
     drift, noise = split_terms(without_constraint(problem.terms))
     stages = solver.tableau.flatten().stages
     stages_at_ends = [stage for stage in stages if stage.c in (0, 1)]
     # The others evaluate noise.
     drift_stages = [stage for stage in stages_at_ends if stage.channels == ("h",)]
-    # The fields that are evaluated at ends of steps, by what they would do there.
     fields = {}
     # Stages that move positions alone evaluate velocities, which do not depend on time.
     if drift and any(stage.writes != "q" for stage in drift_stages):
-        fields["forces jump"] = drift_field(drift, problem.args)
+        fields["forces jump"] = jtu.Partial(drift_rate, drift, problem.args)
     if noise and len(drift_stages) < len(stages_at_ends):
-        fields["noise jumps"] = noise_field(noise, problem.args)
-    for what_happens, field in fields.items():
-        end = _first_jump_at_end(field, problem, problem.y0)
-        if end is not None:
-            return (
-                f"The {what_happens} at step ends, such as t={end:.6g}, and "
-                f"`{type(solver).__name__}` takes one side of the jump for both steps: the "
-                "mean converges to first order only, and two levels do not see it. Pass a "
-                "solver that takes forces and noise within steps, such as "
-                "`ImplicitMidpoint()`."
-            )
-    return None
+        fields["noise jumps"] = jtu.Partial(noise_change, noise, problem.args)
+    return fields
+
+
+class _Steps(NamedTuple):
+    """The shortest steps of a problem, as many as are looked at.
+
+    - `starts`, `h`: when they start, and how long they are.
+    - `near`, `far`: how far before and after a time fields are compared: as near as the
+        rounding of times allows, and as far as smooth fields change little.
+    """
+
+    starts: Float[np.ndarray, " steps"]
+    h: float
+    near: float
+    far: float
+
+    @property
+    def around(self) -> Float[np.ndarray, "4"]:
+        """The times at which fields are compared, from a time between them on."""
+        return np.array([-self.far, -self.near, self.near, self.far])
 
 
 def _steps_to_look_at(problem: Problem) -> _Steps | None:
@@ -212,111 +190,109 @@ def _steps_to_look_at(problem: Problem) -> _Steps | None:
     return _Steps(starts, h, near, far)
 
 
-def _times_of_jumps(
-    field: Field, problem: Problem, steps: _Steps
-) -> Float[np.ndarray, " jumps"]:
-    """When a field jumps within steps, not at their ends."""
+def _times_of_jumps(problem: Problem, steps: _Steps) -> Float[np.ndarray, " jumps"]:
+    """When the forces or the noise jump within steps, not at their ends."""
     # Jumps that are nearer than this to an end of a step do as little harm as those at it,
     # so both ends are left out.
-    interiors = np.stack(
-        [steps.starts + steps.far, steps.starts + steps.h - steps.far], axis=1
-    )
-    interiors = interiors.astype(problem.dtype)
+    interior = np.array([steps.far, steps.h - steps.far])
+    interiors = (steps.starts[:, None] + interior).astype(problem.dtype)
     # Bisection goes on until a part of a step is no longer than `near`.
     halvings = max(0, int(np.ceil(np.log2(steps.h / _PARTS_OF_STEP / steps.near))))
-    near_and_far = np.array([steps.near, steps.far], problem.dtype)
-    times, is_jump = _quick_search(field, problem.y0, interiors, halvings, near_and_far)
-    return np.asarray(times)[np.asarray(is_jump)]
-
-
-def _search(
-    field: Field,
-    y0: Y,
-    intervals: Float[Array, "steps 2"],
-    halvings: int,
-    near_and_far: Float[Array, "2"],
-) -> tuple[Float[Array, " searched"], Bool[Array, " searched"]]:
-    """For the `intervals`, from a start to an end, in which a field changes most: the time
-    at which it changes fastest, and whether it jumps there."""
-    at_both = at_both_states(field, y0)
-    near, far = near_and_far
-
-    def largest_change(interval: Array) -> Array:
-        """The larger of the changes over both halves of an interval."""
-        start, end = interval
-        values = jax.vmap(at_both)(jnp.stack([start, (start + end) / 2, end]))
-        return jnp.max(jnp.linalg.norm(jnp.diff(values, axis=0), axis=1))
-
-    def jump_in(interval: Array) -> tuple[Array, Bool[Array, ""]]:
-        def halve(_, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-            """The half that changes more of a bracket: two times, and the values there."""
-            times, values = bracket
-            middle = jnp.mean(times)
-            value = at_both(middle)
-            changes = jnp.linalg.norm(values - value, axis=1)
-            is_first = changes[0] >= changes[1]
-            first = jnp.array([times[0], middle]), jnp.stack([values[0], value])
-            second = jnp.array([middle, times[1]]), jnp.stack([value, values[1]])
-            return jtu.tree_map(lambda x, y: jnp.where(is_first, x, y), first, second)
-
-        times = jnp.linspace(interval[0], interval[1], _PARTS_OF_STEP + 1)
-        values = jax.vmap(at_both)(times)
-        part = jnp.argmax(jnp.linalg.norm(jnp.diff(values, axis=0), axis=1))
-        both_ends = part + jnp.arange(2)
-        bracket = times[both_ends], values[both_ends]
-        last_times, _ = lax.fori_loop(0, halvings, halve, bracket)
-        time = jnp.mean(last_times)
-        around = jnp.array([-far, -near, near, far])
-        sides = _Sides(*jax.vmap(at_both)(time + around))
-        jump = jnp.linalg.norm(sides.after - sides.before)
-        return time, jump > sides.largest_smooth_change
-
-    changes = lax.map(largest_change, intervals, batch_size=_STEPS_AT_ONCE)
-    _, largest = lax.top_k(changes, min(_MOST_STEPS_SEARCHED, len(intervals)))
-    return jax.vmap(jump_in)(intervals[largest])
+    around = steps.around.astype(problem.dtype)
+    found = _search(all_fields(problem), problem.y0, interiors, halvings, around)
+    times, is_jump = map(np.asarray, found)
+    return times[is_jump]
 
 
 def _first_jump_at_end(field: Field, problem: Problem, y0: Y) -> float | None:
     """The first end of a step at which a field jumps; `None` if there is none. A jump at
     `t0` does not count: paths see only the side after it."""
-    if not depends_on_time(field, problem, y0):
+    if not depends_on_time(field, problem.t0, y0):
         return None
     steps = _steps_to_look_at(problem)
     if steps is None:
         return None
     ends = steps.starts + steps.h
     is_last = np.arange(1, len(ends) + 1) == problem.finest_steps
-    # The times of the four fields of `_Sides`, in their order, and the end itself.
-    offsets = np.array([-steps.far, -steps.near, steps.near, steps.far, 0])
-    times = (ends[:, None] + offsets).astype(problem.dtype)
-    jumps = _quick_jumps_at_ends(field, y0, times, is_last)
-    if not np.any(jumps):
-        return None
-    return float(ends[np.argmax(jumps)])
+    times = (ends[:, None] + np.append(steps.around, 0)).astype(problem.dtype)
+    jumps = _jumps_at_ends(field, y0, times, is_last)
+    return float(ends[np.argmax(jumps)]) if np.any(jumps) else None
 
 
+def _largest_smooth_change(sides: Float[Array, "4 n"]) -> Float[Array, ""]:
+    """The largest change of a field that does not count as a jump: several times the
+    changes on both sides, plus an allowance for rounding. `sides` are its values far and
+    near before a time, and near and far after it."""
+    change_before, _, change_after = jnp.linalg.norm(jnp.diff(sides, axis=0), axis=1)
+    size = jnp.linalg.norm(sides)
+    rounding = jnp.sqrt(jnp.finfo(size.dtype).eps) * size
+    return _JUMP_PER_SMOOTH_CHANGE * (change_before + change_after) + rounding
+
+
+@ft.partial(compiled, quickly=True)
+def _search(
+    field: Field,
+    y0: Y,
+    intervals: Float[Array, "steps 2"],
+    halvings: int,
+    around: Float[Array, "4"],
+) -> tuple[Float[Array, " searched"], Bool[Array, " searched"]]:
+    """For the `intervals`, from a start to an end, in which a field changes most: the time
+    at which it changes fastest, and whether it jumps there, by its values `around` it."""
+    at_both = at_both_states(field, y0)
+
+    def changes(times: Float[Array, " times"]) -> Float[Array, " intervals"]:
+        """The changes from each time to the next."""
+        values = jax.vmap(at_both)(times)
+        return jnp.linalg.norm(jnp.diff(values, axis=0), axis=1)
+
+    def with_middle(interval: Float[Array, "2"]) -> Float[Array, "3"]:
+        start, end = interval
+        return jnp.stack([start, (start + end) / 2, end])
+
+    def largest_change(interval: Float[Array, "2"]) -> Float[Array, ""]:
+        """The larger of the changes over both halves of an interval."""
+        return jnp.max(changes(with_middle(interval)))
+
+    def half_that_changes_more(_, interval: Float[Array, "2"]) -> Float[Array, "2"]:
+        times = with_middle(interval)
+        in_first, in_second = changes(times)
+        return jnp.where(in_first >= in_second, times[:2], times[1:])
+
+    def jump_in(interval: Float[Array, "2"]) -> tuple[Array, Bool[Array, ""]]:
+        times = jnp.linspace(interval[0], interval[1], _PARTS_OF_STEP + 1)
+        part = times[jnp.argmax(changes(times)) + jnp.arange(2)]
+        time = jnp.mean(lax.fori_loop(0, halvings, half_that_changes_more, part))
+        sides = jax.vmap(at_both)(time + around)
+        jump = jnp.linalg.norm(sides[2] - sides[1])
+        return time, jump > _largest_smooth_change(sides)
+
+    changes_in_steps = lax.map(largest_change, intervals, batch_size=_STEPS_AT_ONCE)
+    num_searched = min(_MOST_STEPS_SEARCHED, len(intervals))
+    _, largest = lax.top_k(changes_in_steps, num_searched)
+    return jax.vmap(jump_in)(intervals[largest])
+
+
+@ft.partial(compiled, quickly=True)
 def _jumps_at_ends(
     field: Field, y0: Y, times: Float[Array, "ends 5"], is_last: Bool[Array, " ends"]
 ) -> Bool[Array, " ends"]:
     """For the end of each step, whether a field jumps there, and does not have the mean of
-    both sides as its value, which would be right. `times` are those of the fields of
-    `_Sides` and the end itself."""
+    both sides as its value, which would be right. `times` are far and near before the end,
+    near and far after it, and the end itself."""
     at_both = at_both_states(field, y0)
 
     def jumps_at(end: tuple[Array, Array]) -> Bool[Array, ""]:
         times, is_last = end
-        *side_values, value = jax.vmap(at_both)(times)
-        sides = _Sides(*side_values)
-        off_mean = jnp.linalg.norm(value - (sides.before + sides.after) / 2)
+        values = jax.vmap(at_both)(times)
+        sides = values[:4]
+        value = values[4]
+        off_mean = jnp.linalg.norm(value - (sides[1] + sides[2]) / 2)
         # No step follows the last end, so the value of the side before is right there, too.
-        off_before = jnp.linalg.norm(value - sides.before)
+        off_before = jnp.linalg.norm(value - sides[1])
         error = jnp.where(is_last, jnp.minimum(off_mean, off_before), off_mean)
         # A field with the value of one side is off the mean by half of its jump. (With a
         # NaN among the values, the comparison is false: that is no jump.)
-        return 2 * error > sides.largest_smooth_change
+        return 2 * error > _largest_smooth_change(sides)
 
     return lax.map(jumps_at, (times, is_last), batch_size=_STEPS_AT_ONCE)
-
-
-_quick_search = compiled(_search, quickly=True)
-_quick_jumps_at_ends = compiled(_jumps_at_ends, quickly=True)

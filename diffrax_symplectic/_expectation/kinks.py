@@ -1,14 +1,12 @@
 """Whether `phi` may have kinks or jumps, by the operations that it is made of."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.tree_util as jtu
 from jaxtyping import PyTree
 
 from .._compat import dce_jaxpr, Jaxpr, Literal, programs_in
-from .._custom_types import Args
 from .._programs import once_for_each_signature
 from .._simulation import Problem
 
@@ -21,14 +19,12 @@ _NOT_SMOOTH = frozenset(
 )
 
 
+@once_for_each_signature
 def has_kinks(problem: Problem) -> bool:
     """Whether the problem's `phi` may not be smooth."""
-    return _has_kinks(problem.phi, problem.t0, problem.y0, problem.args)
-
-
-@once_for_each_signature
-def _has_kinks(phi: Callable, t0: Any, y0: PyTree, args: Args) -> bool:
-    return may_have_kinks(lambda y: phi(t0, y, args), y0)
+    return may_have_kinks(
+        lambda y: problem.phi(problem.t0, y, problem.args), problem.y0
+    )
 
 
 def may_have_kinks(fn: Callable, y: PyTree) -> bool:

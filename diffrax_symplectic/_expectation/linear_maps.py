@@ -1,13 +1,37 @@
-"""The direction that a linear map enlarges most, by power iteration, and directions without
-symmetries."""
+"""What a linear map does to vectors that it is applied to again and again, by power
+iteration, and directions without symmetries."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.flatten_util as jfu
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
+
+from .._custom_types import Y
+
+
+# So many applications of power iteration find the direction of the largest frequency, and
+# as many more measure it.
+_ITERATIONS_FOR_FREQUENCY = 15
+
+
+def linearized(
+    field: Callable[[Any, Y], PyTree[Array]], t: Any, y0: Y
+) -> tuple[Callable[[Array], Array], Float[Array, " n"]]:
+    """The derivative of `field(t, y)` by the state at `y0`, as a linear map of vectors, and
+    `y0` as a vector."""
+    flat_y0, unravel = jfu.ravel_pytree(y0)
+
+    def flat_field(x: Array) -> Array:
+        return jfu.ravel_pytree(field(t, unravel(x)))[0]
+
+    def derivative(change: Array) -> Array:
+        return jax.jvp(flat_field, (flat_y0,), (change,))[1]
+
+    return derivative, flat_y0
 
 
 class Growth(NamedTuple):
@@ -50,15 +74,24 @@ def largest_growth(
     return lax.fori_loop(0, 2 * iterations, after_map, start)
 
 
-def derivative_at(
-    fn: Callable[[Array], Array], x: Float[Array, " n"]
-) -> Callable[[Array], Array]:
-    """The derivative of a function at `x`, as a linear map of changes of `x`."""
+def largest_frequency(
+    field: Callable[[Any, Y], PyTree[Array]], t: Any, y0: Y
+) -> Float[Array, ""]:
+    """The largest angular frequency of the equation `dy/dt = field(t, y)` near `y0`; zero
+    where growth without oscillation is faster."""
+    derivative, flat_y0 = linearized(field, t, y0)
 
-    def derivative(change: Array) -> Array:
-        return jax.jvp(fn, (x,), (change,))[1]
+    # The derivative has the eigenvalues i omega and -i omega of an oscillation, for which
+    # power iteration does not converge. Its square has -omega^2 for all directions in the
+    # plane of the oscillation.
+    def derivative_twice(change: Array) -> Array:
+        # A loop, so that the derivative is compiled once.
+        return lax.fori_loop(0, 2, lambda _, change: derivative(change), change)
 
-    return derivative
+    growth = largest_growth(derivative_twice, flat_y0, _ITERATIONS_FOR_FREQUENCY)
+    oscillates = growth.rayleigh_quotient < 0
+    # Each application multiplies by omega^2, so omega is the root of the growth.
+    return jnp.where(oscillates, jnp.exp(growth.log_growth / 2), 0)
 
 
 def arbitrary_direction(size: int, dtype: Any) -> Float[Array, " size"]:

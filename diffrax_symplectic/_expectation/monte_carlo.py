@@ -1,6 +1,5 @@
 """Averages of any function of a random key."""
 
-import functools as ft
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -142,30 +141,24 @@ def monte_carlo(
             ]
         check_untraced("`monte_carlo`", programs)
         sampler = jtu.Partial(_samples_of_programs, programs, weights)
-        outputs = _outputs(programs, key, len(weights))
-        # At least a number of four bytes on each level.
-        bytes_of_path = 4 * levels
-        plan = sampling.plan(sampler, outputs, devices, bytes_of_path)
-        plan = plan._replace(digests=dict(fn=digest(programs), order=digest(order)))
+        # A path has at least a number of four bytes on each level.
+        plan = sampling.plan(sampler, _outputs(programs, key), devices, 4 * levels)
         progress.stage("compiling and sampling")
         estimate = run(
-            plan, key, devices, sampling, start, first, tol, progress, kept=kept
-        )
+            plan, key, devices, start, first, tol, progress, kept,
+            sampling=sampling,
+            digests=dict(fn=digest(programs), order=digest(order)),
+        )  # fmt: skip
         advice = advice_on_failures(has_bounded_increments=False, is_implicit=False)
         for message in cautions(estimate, tol, advice):
             warnings.warn(message, stacklevel=2)
     return estimate
 
 
-def _outputs(
-    programs: list[Traced], key: PRNGKeyArray, num_combinations: int
-) -> Outputs:
+def _outputs(programs: list[Traced], key: PRNGKeyArray) -> Outputs:
     """The numbers of phi, from the program of each level. Raises a `ValueError` unless phi
     has the same layout on all levels."""
-    structs = []
-    for program in programs:
-        struct_of_phi, _ = jax.eval_shape(program, key)
-        structs.append(struct_of_phi)
+    structs = [jax.eval_shape(program, key)[0] for program in programs]
     layout, *other_layouts = map(Layout.of, structs)
     if any(other != layout for other in other_layouts):
         raise ValueError(
@@ -175,7 +168,7 @@ def _outputs(
     # Rounding errors are those of the least precise of the dtypes.
     dtypes = {leaf.dtype for leaf in jtu.tree_leaves(structs)}
     dtype = min(dtypes, key=lambda dtype: jnp.finfo(dtype).bits)
-    return Outputs(layout, len(programs), num_combinations, str(dtype))
+    return Outputs(layout, len(programs), str(dtype))
 
 
 def _samples_of_programs(
@@ -185,16 +178,10 @@ def _samples_of_programs(
 ) -> Samples:
     """A sample is a value of the function, with the same random key on all levels, for each
     of which there is a program."""
-
-    def vector_and_success(program: Traced, key: PRNGKeyArray) -> tuple[Array, Array]:
-        phi, success = program(key)
-        return real_vector(phi), success
-
-    values_and_success = [
-        jax.vmap(ft.partial(vector_and_success, program))(keys) for program in programs
-    ]
+    phi_and_success = [jax.vmap(program)(keys) for program in programs]
     # (levels, n, numbers) and (levels, n)
-    values, success = jtu.tree_map(lambda *xs: jnp.stack(xs), *values_and_success)
+    values = jnp.stack([jax.vmap(real_vector)(phi) for phi, _ in phi_and_success])
+    success = jnp.stack([success for _, success in phi_and_success])
     return Samples(
         averaged=Averaged(combinations(weights, values)),
         good=jnp.all(success, axis=0),

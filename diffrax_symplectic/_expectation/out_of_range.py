@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array
 
 from .._compat import CALLS, results_of_operation, results_of_program
 from .._custom_types import Terms
@@ -73,7 +72,7 @@ def _lost_on_the_way(problem: Problem, terms: Terms) -> str | None:
     def first_evaluation(*leaves: Any) -> Any:
         y = treedef.unflatten(leaves)
         structs = [control_struct(term, t0) for term in terms]
-        controls = [jtu.tree_map(_ones, struct) for struct in structs]
+        controls = jtu.tree_map(lambda x: jnp.ones(x.shape, x.dtype), structs)
         changes = [term.vf_prod(t0, y, args, x) for term, x in zip(terms, controls)]
         return changes, problem.phi(t0, y, args)
 
@@ -84,36 +83,29 @@ def _lost_on_the_way(problem: Problem, terms: Terms) -> str | None:
         if name in CALLS:
             return results_of_program(eqn.params[CALLS[name]], values, results_of)
         results = results_of_operation(eqn, values, eqn.params)
-        if name in _ARITHMETIC and _is_float(results[0]):
+        if name in _ARITHMETIC and _is_float(results[0]) and not losses:
             losses.extend(_loss(name, values, results[0]))
         return results
 
     traced = jax.make_jaxpr(first_evaluation)(*leaves)
     results = results_of_program(traced, leaves, results_of)
     are_finite = all(np.all(np.isfinite(_in_float64(x))) for x in results)
-    return None if are_finite or len(losses) == 0 else losses[0]
-
-
-def _ones(struct: jax.ShapeDtypeStruct) -> Array:
-    return jnp.ones(struct.shape, struct.dtype)
+    return None if are_finite else next(iter(losses), None)
 
 
 def _loss(name: str, values: list[Any], result: Any) -> Iterator[str]:
     """The first entry that overflowed or underflowed in an operation of arithmetic, such as
     `1e-30 * 1e-30 is 0`; nothing if there is none."""
-    wide_result = _in_float64(result)
-    shape = wide_result.shape
-    operands = [np.broadcast_to(_in_float64(x), shape).ravel() for x in values]
-    results = wide_result.ravel()
+    results = _in_float64(result)
+    operands = [np.broadcast_to(_in_float64(x), results.shape) for x in values]
     # If an operand is already zero or infinite, so may be the result, with nothing lost.
     has_size = np.all([np.isfinite(x) & (x != 0) for x in operands], axis=0)
     is_lost = has_size & ((results == 0) | ~np.isfinite(results))
     if np.any(is_lost):
-        first = int(np.argmax(is_lost))
-        texts = [f"{operand[first]:.2g}" for operand in operands]
+        texts = [f"{operand[is_lost][0]:.2g}" for operand in operands]
         sign = _ARITHMETIC[name]
         formula = f" {sign} ".join(texts) if len(texts) > 1 else f"{texts[0]} {sign}"
-        yield f"{formula} is {'0' if results[first] == 0 else 'infinite'}"
+        yield f"{formula} is {'0' if results[is_lost][0] == 0 else 'infinite'}"
 
 
 def _is_float(x: Any) -> bool:

@@ -1,9 +1,8 @@
 """The loop that computes estimates, batch after batch, on any devices."""
 
-import collections
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.random as jr
@@ -29,7 +28,7 @@ from .estimate import (
     share_of_needed,
 )
 from .progress import Progress
-from .sampling import Averaged, MOST_SAMPLES, Samples, SamplingPlan
+from .sampling import MOST_SAMPLES, Samples, SamplingPlan
 
 
 class Kept:
@@ -53,21 +52,20 @@ def run(
     plan: SamplingPlan,
     key: PRNGKeyArray,
     devices: Devices,
-    sampling: Any = None,
     start: Expectation | None = None,
     first: int = 0,
     tol: float | None = None,
     progress: Progress | None = None,
-    ts: np.ndarray | None = None,
     kept: Kept | None = None,
+    **fields: Any,
 ) -> Expectation:
     """The estimate from the samples of a plan, which continues `start`, or without it
     begins with sample number `first`. With a tolerance `tol` it may end before all samples
-    of the plan. The result does not depend on the number of devices. `ts` and `sampling`
-    become fields of the result. `kept`, if there is one, gets the estimate after each
-    batch, for the case of an interrupt."""
-    # The numbers of the first sample of all, of the first that is not in `start`, and one
-    # past the last.
+    of the plan. The result does not depend on the number of devices. `kept`, if there is
+    one, gets the estimate after each batch, for the case of an interrupt. `fields` are
+    further fields of the result."""
+    # The numbers of the first sample of all, of the first that is not in the estimate yet,
+    # and one past the last.
     begin = first if start is None else start.moments[0].begin
     next_sample = first if start is None else start.moments[-1].end
     end = begin + plan.num_samples
@@ -76,20 +74,14 @@ def run(
             f"Samples have numbers below 2^63; got {plan.num_samples} from number {begin} "
             "on. Pass a smaller number of paths (or replicates), or a smaller `first`."
         )
-    batches = _Batches(plan, key, devices)
-    no_moments = _moments_of_no_samples(plan, next_sample)
     estimate = Expectation(
-        moments=(no_moments,),
-        key_data=batches.key_data,
-        layout=plan.outputs.layout,
-        dtype=plan.outputs.dtype,
+        moments=(),
+        key_data=np.asarray(jr.key_data(key)),
         paths_per_sample=plan.paths_per_sample,
-        rounding_floor=plan.rounding_floor,
-        sampling=sampling,
-        reason=plan.reason,
+        reason=plan.reason if start is None else start.reason,
         tol_reached=None if tol is None else False,
-        digests=plan.digests,
-        ts=ts,
+        **plan.outputs._asdict(),
+        **fields,
     )
     kept = Kept() if kept is None else kept
     if start is not None:
@@ -104,73 +96,50 @@ def run(
         kept.estimate = estimate
 
     def needs_no_more_samples() -> bool:
-        return _needs_no_more_samples(estimate, plan, tol)
+        """Whether there are enough samples for the tolerance, or more would not help:
+        because the error of the steps, or of failed paths, is too large beside that of
+        sampling."""
+        least = plan.least_beside_steps if tol is None else plan.least_samples
+        if least is None or estimate.num_samples < least:
+            return False
+        if tol is None:
+            return is_bounded_by_steps(estimate)
+        return is_reached(estimate, tol) or is_stuck(estimate, tol)
 
-    running_batches: collections.deque[_RunningBatch] = collections.deque()
-    # One past the last sample of the batches that were started.
-    end_of_started = next_sample
-    # Batches are started one ahead: while a batch is being computed, the one before it is
-    # added to the estimate.
-    while True:
-        starts_batch = end_of_started < end and not needs_no_more_samples()
-        if starts_batch:
-            running_batches.append(batches.start(end_of_started, end))
-            end_of_started += batches.size * len(devices)
-        has_previous = len(running_batches) > (1 if starts_batch else 0)
-        if has_previous:
-            for device_moments in batches.moments_of_devices(running_batches.popleft()):
-                # The moments of each device are a batch of their own: where to stop
-                # does not depend on how many devices there are.
-                if _end_of(estimate) == end or needs_no_more_samples():
-                    break
-                estimate = _with_batch(estimate, device_moments, batches.size, end)
-                kept.estimate = estimate
-            if progress is not None:
-                share = (_end_of(estimate) - begin) / plan.num_samples
-                progress.step(max(share, share_of_needed(estimate, tol)))
-        elif not starts_batch:
-            break
+    batches = _Batches(plan, key, devices)
+    firsts = iter(range(next_sample, end, batches.size * len(devices)))
+
+    def started_batch() -> Callable[[], list[BatchMoments]] | None:
+        """The next batch, if there is one and it is needed."""
+        first_of_batch = None if needs_no_more_samples() else next(firsts, None)
+        return None if first_of_batch is None else batches.start(first_of_batch, end)
+
+    batch = started_batch()
+    while batch is not None:
+        # Batches are started one ahead: while a batch is being computed, the one before it
+        # is added to the estimate.
+        batch_ahead = started_batch()
+        for device_moments in batch():
+            # The moments of each device are a batch of their own: where to stop does not
+            # depend on how many devices there are.
+            if next_sample == end or needs_no_more_samples():
+                break
+            batch_begin = next_sample
+            next_sample = min(batch_begin + batches.size, end)
+            moments = _in_float64(device_moments, batch_begin, next_sample)
+            moments_of_all = combined_in_halves((*estimate.moments, moments))
+            estimate = dataclasses.replace(estimate, moments=moments_of_all)
+            kept.estimate = estimate
+        if progress is not None:
+            share = (next_sample - begin) / plan.num_samples
+            progress.step(max(share, share_of_needed(estimate, tol)))
+        batch = batch_ahead
     if tol is not None:
         has_enough = estimate.num_samples >= plan.least_samples
         tol_reached = has_enough and is_reached(estimate, tol)
         estimate = dataclasses.replace(estimate, tol_reached=tol_reached)
     kept.estimate = estimate
     return estimate
-
-
-def _end_of(estimate: Expectation) -> int:
-    """One past the last sample of the estimate."""
-    return estimate.moments[-1].end
-
-
-def _with_batch(
-    estimate: Expectation,
-    device_moments: BatchMoments,
-    batch_size: int,
-    end: int,
-) -> Expectation:
-    """The estimate with the next batch, of one device. Only the samples before number `end`
-    count."""
-    begin = _end_of(estimate)
-    batch_end = min(begin + batch_size, end)
-    new_moments = _in_float64(device_moments, begin, batch_end)
-    moments = combined_in_halves((*estimate.moments, new_moments))
-    return dataclasses.replace(estimate, moments=moments)
-
-
-class _RunningBatch(NamedTuple):
-    """A batch that has been started.
-
-    - `first`: the number of its first sample.
-    - `end`: samples with this number and larger ones do not count.
-    - `has_newton`: whether Newton's method solves steps that sweeps do not.
-    - `moments`: the moments on all devices, once they are computed.
-    """
-
-    first: int
-    end: int
-    has_newton: bool
-    moments: BatchMoments
 
 
 class _Batches:
@@ -182,7 +151,7 @@ class _Batches:
 
     def __init__(self, plan: SamplingPlan, key: PRNGKeyArray, devices: Devices):
         self.size = min(plan.batch_size, plan.num_samples)
-        self.key_data = np.asarray(jr.key_data(key))
+        self._key_data = np.asarray(jr.key_data(key))
         self._key_impl = jr.key_impl(key)
         self._sampler_with_newton = _for_all_processes(plan.sampler)
         self._sampler = self._sampler_with_newton
@@ -196,34 +165,26 @@ class _Batches:
         )
         self._mesh = Mesh(np.array(devices), ("samples",))
 
-    def _sampler_at(self, first: int) -> Callable[..., Samples]:
-        """The sampler for the batch from sample number `first` on."""
-        if self._simulate_paths is None:
-            return self._sampler
-        paths = self._simulate_paths(first, self.size)
-        # Not `jtu.Partial(self._sampler, paths)`: the function of a `Partial` is static, so
-        # with arrays in it, as in the sampler, JAX would compile for each batch.
-        return jtu.Partial(_samples_of_paths, self._sampler, paths)
-
-    def start(self, first: int, end: int) -> "_RunningBatch":
+    def start(self, first: int, end: int) -> Callable[[], list[BatchMoments]]:
         """Starts a batch on all devices, from sample number `first` on. Samples from number
-        `end` on do not count."""
-        moments = self._batch_moments(*self._arguments_of_batch(first, end))
-        has_newton = self._sampler is self._sampler_with_newton
-        return _RunningBatch(first, end, has_newton, moments)
-
-    def _arguments_of_batch(self, first: int, end: int) -> tuple[Any, ...]:
-        """The arguments of `batch_moments` for `start(first, end)`."""
+        `end` on do not count. Returns a function that waits for the moments on each
+        device."""
         num_devices = len(self._devices)
         low_high = np.array([first & 0xFFFFFFFF, first >> 32], np.uint32)
-        num_wanted = max(0, min(self.size * num_devices, end - first))
-        num_wanted = np.array(num_wanted, np.int32)
+        num_wanted = np.array(min(self.size * num_devices, end - first), np.int32)
         if num_devices == 1:
             on_device = jax.device_put((low_high, num_wanted), self._devices[0])
             low_high, num_wanted = on_device
-        return (
-            self._sampler_at(first),
-            self.key_data,
+        takes_newton = self._sampler is self._sampler_with_newton
+        sampler = self._sampler
+        if self._simulate_paths is not None:
+            # Not `jtu.Partial(sampler, paths)`: the function of a `Partial` is static, so
+            # with arrays in it, as in the sampler, JAX would compile for each batch.
+            paths = self._simulate_paths(first, self.size)
+            sampler = jtu.Partial(_samples_of_paths, sampler, paths)
+        moments = self._batch_moments(
+            sampler,
+            self._key_data,
             self._key_impl,
             low_high,
             num_wanted,
@@ -231,17 +192,18 @@ class _Batches:
             self.size,
         )
 
-    def moments_of_devices(self, running_batch: "_RunningBatch") -> list[BatchMoments]:
-        """The moments on each device, copied to the host as soon as they are computed."""
-        # The moments are traced if a function closes over traced values.
-        check_untraced("`expectation` or `monte_carlo`", running_batch.moments)
-        moments = jax.device_get(running_batch.moments)
-        if not running_batch.has_newton and np.any(moments.any_failed):
-            self._sampler = self._sampler_with_newton
-            again = self.start(running_batch.first, running_batch.end)
-            moments = jax.device_get(again.moments)
-        num_devices = len(self._devices)
-        return [jtu.tree_map(lambda x, k=k: x[k], moments) for k in range(num_devices)]
+        def moments_of_devices() -> list[BatchMoments]:
+            # The moments are traced if a function closes over traced values.
+            check_untraced("`expectation` or `monte_carlo`", moments)
+            on_host = jax.device_get(moments)
+            if not takes_newton and np.any(on_host.any_failed):
+                self._sampler = self._sampler_with_newton
+                return self.start(first, end)()
+            return [
+                jtu.tree_map(lambda x, k=k: x[k], on_host) for k in range(num_devices)
+            ]
+
+        return moments_of_devices
 
 
 def _is_problem(x: Any) -> bool:
@@ -283,25 +245,6 @@ def _samples_of_paths(
     return sampler(paths, keys)
 
 
-def _moments_of_no_samples(plan: SamplingPlan, first: int) -> Moments:
-    """The moments of no samples, which the batch from sample number `first` on
-    continues."""
-    outputs = plan.outputs
-    zeros = np.zeros((outputs.num_combinations, outputs.layout.size))
-    averaged = Averaged(**dict.fromkeys(plan.fields, zeros))
-    return Moments(
-        begin=first,
-        end=first,
-        num_good=0,
-        num_failed=0,
-        failed_on=(0,) * outputs.levels,
-        mean=averaged,
-        norm=averaged,
-        largest=averaged,
-        size=averaged,
-    )
-
-
 def _in_float64(device_moments: BatchMoments, begin: int, end: int) -> Moments:
     """The moments of samples `begin` to `end - 1`, in float64."""
     # Single precision could not hold the sum of a mean and its correction.
@@ -317,16 +260,3 @@ def _in_float64(device_moments: BatchMoments, begin: int, end: int) -> Moments:
         largest=wide.largest,
         size=wide.size,
     )
-
-
-def _needs_no_more_samples(
-    estimate: Expectation, plan: SamplingPlan, tol: float | None
-) -> bool:
-    """Whether there are enough samples for the tolerance, or more would not help: because
-    the error of the steps, or of failed paths, is too large beside that of sampling."""
-    least = plan.least_beside_steps if tol is None else plan.least_samples
-    if least is None or estimate.num_samples < least:
-        return False
-    if tol is None:
-        return is_bounded_by_steps(estimate)
-    return is_reached(estimate, tol) or is_stuck(estimate, tol)

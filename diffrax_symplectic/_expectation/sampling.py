@@ -69,26 +69,22 @@ class Samples(eqx.Module):
 
 
 class Outputs(NamedTuple):
-    """The numbers that are averaged.
+    """The numbers that are averaged: fields of an `Expectation`.
 
     - `layout`: how they make PyTrees like `phi`.
     - `levels`: the number of levels.
-    - `num_combinations`: the number of combinations of levels.
     - `dtype`: the dtype in which they are computed.
     """
 
     layout: Layout
     levels: int
-    num_combinations: int
     dtype: str
 
     @staticmethod
     def of(problem: Problem) -> "Outputs":
         """The values of the `phi` of a problem."""
-        num_combinations, levels = problem.weights.shape
-        return Outputs(
-            problem.layout, levels, num_combinations, str(problem.dtype_of_values)
-        )
+        levels = len(problem.levels.h)
+        return Outputs(problem.layout, levels, str(problem.dtype_of_values))
 
 
 class SamplingPlan(NamedTuple):
@@ -96,7 +92,6 @@ class SamplingPlan(NamedTuple):
 
     - `sampler`: a callable PyTree that makes one sample for each of several random keys.
     - `outputs`: the numbers that are averaged.
-    - `fields`: the fields that samples have of `Averaged`.
     - `num_samples`: the most samples, including the samples of an estimate to continue.
     - `batch_size`: the number of samples that each device takes at once.
     - `paths_per_sample`: the number of paths in a sample, on each level.
@@ -109,7 +104,6 @@ class SamplingPlan(NamedTuple):
         it, by trials.
     - `is_quick`: whether the samples take less time than compiling their program, which is
         then compiled for speed of compilation.
-    - `rounding_floor`, `digests`: as in `Expectation`.
     - `simulate_paths`: for paths computed outside JAX, maps the number of the first sample
         and the number of samples to an argument that the sampler takes before the keys.
     - `with_halved_steps`: makes the plan with halved steps on all levels, whose samples
@@ -120,15 +114,12 @@ class SamplingPlan(NamedTuple):
     outputs: Outputs
     num_samples: int
     batch_size: int
-    fields: tuple[str, ...] = ("value",)
     paths_per_sample: int = 1
     least_samples: int = 2
     least_beside_steps: int | None = None
     reason: str = ""
     remainder: float = 0.0
     is_quick: bool = False
-    rounding_floor: int = 1
-    digests: dict[str, str] | None = None
     simulate_paths: Callable[[int, int], Any] | None = None
     with_halved_steps: Callable[[], "SamplingPlan"] | None = None
 

@@ -1,16 +1,17 @@
 """Whether steps are too long for the friction of Langevin terms, where paths start."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+import functools as ft
 
 import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
+from .._brownian import zeros_and_unravel
 from .._compat import unwrapped
 from .._custom_types import Terms
 from .._programs import compiled
@@ -31,8 +32,9 @@ from .._terms import (
     split_friction,
     tree_sum,
 )
-from .fields_in_time import drift_field
-from .linear_maps import derivative_at, largest_growth
+from .fields_in_time import drift_rate
+from .linear_maps import largest_growth, linearized
+from .long_steps import drift_frequencies
 
 
 # With a flow, a mode relaxes too slowly if it turns by more than this in a step, and the
@@ -58,18 +60,6 @@ _DOUBLINGS = 16
 _COSINE_OF_PARALLEL = 0.9
 
 
-class _Rates(NamedTuple):
-    """The largest rates of the equation at the start.
-
-    - `friction`: the rate at which friction takes away a momentum.
-    - `squared_frequency`: the square of the angular frequency of a vibration without
-        friction, or zero if the stiffest direction is unstable.
-    """
-
-    friction: Float[Array, ""]
-    squared_frequency: Float[Array, ""]
-
-
 def unresolved_friction(problem: Problem, dt0: float) -> str | None:
     """What is wrong with steps of `dt0` for the friction at the start of a path, as a
     sentence; `None` if nothing is, or for solvers of others. Two levels need not show it:
@@ -81,81 +71,64 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
     if constraint_of(problem.terms) is not None:
         return None
     drift, friction, noise = split_friction(problem.terms)
-    record = solver.record
-    # In units of 1 / `dt0`; `None` if the solver takes every friction.
-    most_friction = None if record is None else record.most_friction
-    if drift and noise and not friction and most_friction is not None:
-        return _unresolved_decay(problem, dt0, most_friction)
-    if not friction or not noise:
+    if not noise:
         return None
+    beginning = f"Steps of `dt0={dt0:g}` do not resolve"
+    name = type(solver).__name__
+    # In units of 1 / `dt0`; `None` if the solver takes every friction.
+    most_friction = None if solver.record is None else solver.record.most_friction
+    if not friction:
+        # Friction that is a part of the drift, such as the loss of a wave. Only a state
+        # that decays hardly oscillating counts.
+        if not drift or most_friction is None:
+            return None
+        decay = float(_decay(problem)) * dt0
+        if not decay > most_friction:
+            return None
+        return (
+            f"{beginning} a decay: where paths start, the drift damps the state at a rate "
+            f"of {decay:.3g} / `dt0`, and `{name}` has the right size of fluctuations only "
+            f"up to {most_friction:g} / `dt0`. Pass a smaller `dt0`."
+        )
     has_flow = isinstance(solver, AbstractLangevinSplitting) and solver.has_flow
-    may_change = _depends_on_positions(problem, friction)
+    p0, q0 = problem.y0
+    force = ft.partial(_friction_force, problem, friction)
+    # Whether its program reads the positions: forces at several might be equal by chance.
+    # (A velocity has the shape of its momentum.)
+    may_change = not Dependence(force, q0, p0).independent(lambda q, velocity: q)
     if most_friction is None and not has_flow and not may_change:
         return None
-    rates = _quick_rates(problem)
-    name = type(solver).__name__
-    friction_of_step = float(rates.friction) * dt0
-    angle = float(rates.squared_frequency) ** 0.5 * dt0
+    friction_of_step = float(_friction_rate(problem)) * dt0
     if most_friction is not None and friction_of_step > most_friction:
         return (
-            f"Steps of `dt0={dt0:g}` do not resolve the friction: momenta decay at a rate "
-            f"of {friction_of_step:.3g} / `dt0` where paths start, and `{name}` has the "
-            f"right temperature only up to {most_friction:g} / `dt0`. Pass a smaller "
-            "`dt0`, or `BAOAB()`, which takes every friction."
+            f"{beginning} the friction: momenta decay at a rate of "
+            f"{friction_of_step:.3g} / `dt0` where paths start, and `{name}` has the right "
+            f"temperature only up to {most_friction:g} / `dt0`. Pass a smaller `dt0`, or "
+            "`BAOAB()`, which takes every friction."
         )
-    if has_flow and friction_of_step > _MOST_BY_FLOW and angle > _MOST_BY_FLOW:
+    angle = 0.0
+    if has_flow and friction_of_step > _MOST_BY_FLOW:
+        (frequency,) = drift_frequencies(problem, np.zeros(1, problem.dtype))
+        angle = float(frequency) * dt0
+    if angle > _MOST_BY_FLOW:
         return (
-            f"Steps of `dt0={dt0:g}` do not resolve a vibration with strong friction, "
-            f"omega h = {angle:.3g} where paths start: with a `flow`, `{name}` keeps its "
-            "stationary law, but takes its position to the other side in each step, and "
-            "relaxes far too slowly. Pass `dt0` below 2 / omega, and `BAOAB()` if "
-            "masses are constant."
+            f"{beginning} a vibration with strong friction, omega h = {angle:.3g} where "
+            f"paths start: with a `flow`, `{name}` keeps its stationary law, but takes its "
+            "position to the other side in each step, and relaxes far too slowly. Pass "
+            "`dt0` below 2 / omega, and `BAOAB()` if masses are constant."
         )
-    if may_change and friction_of_step > _HARDLY_DAMPED:
-        return _unresolved_change(problem, dt0, friction_of_step)
-    return None
-
-
-def _unresolved_decay(problem: Problem, dt0: float, most_friction: float) -> str | None:
-    """`unresolved_friction` for friction that is a part of the drift, such as the loss of a
-    wave. Only a state that decays hardly oscillating counts."""
-    decay = float(_quick_decay(problem)) * dt0
-    if not decay > most_friction:
+    if not may_change or not friction_of_step > _HARDLY_DAMPED:
         return None
-    return (
-        f"Steps of `dt0={dt0:g}` do not resolve a decay: where paths start, the drift "
-        f"damps the state at a rate of {decay:.3g} / `dt0`, and "
-        f"`{type(problem.solver).__name__}` has the right size of fluctuations only up to "
-        f"{most_friction:g} / `dt0`. Pass a smaller `dt0`."
-    )
-
-
-def _unresolved_change(
-    problem: Problem, dt0: float, friction_of_step: float
-) -> str | None:
-    """`unresolved_friction` for the change of strong friction with positions."""
-    change = float(_quick_change(problem, dt0))
+    change = float(_change_along_step(problem))
     if not change > _MOST_CHANGE:
         return None
     return (
-        f"Steps of `dt0={dt0:g}` do not resolve how the friction changes with positions: "
-        f"by {change:.0%} along one step from where paths start, at the speed of the heat "
-        f"bath, while momenta decay at a rate of {friction_of_step:.3g} / `dt0`. Two "
-        "levels may agree on a wrong mean, as of a diffusion. Pass a smaller `dt0`, in "
-        "which the friction changes, or turns, by a small part."
+        f"{beginning} how the friction changes with positions: by {change:.0%} along one "
+        "step from where paths start, at the speed of the heat bath, while momenta decay "
+        f"at a rate of {friction_of_step:.3g} / `dt0`. Two levels may agree on a wrong "
+        "mean, as of a diffusion. Pass a smaller `dt0`, in which the friction changes, or "
+        "turns, by a small part."
     )
-
-
-def _depends_on_positions(problem: Problem, friction: Terms) -> bool:
-    """Whether the friction depends on positions: whether its program reads them. (Forces at
-    several positions might be equal by chance.)"""
-    p0, q0 = problem.y0
-
-    def force(q: PyTree[Array], velocity: PyTree[Array]) -> Float[Array, " n"]:
-        return _friction_force(problem, friction, q, velocity)
-
-    # A velocity has the shape of its momentum.
-    return not Dependence(force, q0, p0).independent(lambda q, velocity: q)
 
 
 def _friction_force(
@@ -167,14 +140,17 @@ def _friction_force(
     return jfu.ravel_pytree(tree_sum(forces))[0]
 
 
-def _change_along_step(problem: Problem, dt0: float) -> Float[Array, ""]:
-    """How much the friction changes with positions along one step, relative to the friction
-    where paths start. For a few thermal velocities, the force of the friction on the same
-    velocity is compared before and after the step, in the root mean square."""
+@ft.partial(compiled, quickly=True)
+def _change_along_step(problem: Problem) -> Float[Array, ""]:
+    """How much the friction changes with positions along the first step, relative to the
+    friction where paths start. For a few thermal velocities, the force of the friction on
+    the same velocity is compared before and after the step, in the root mean square."""
     drift, friction, noise = split_friction(problem.terms)
     bath_noise = tuple(term for term in noise if isinstance(unwrapped(term), BathNoise))
     p0, q0 = problem.y0
-    controls = [control_struct(term, problem.t0) for term in bath_noise]
+    dt0 = problem.level(0).h
+    structs = [control_struct(term, problem.t0) for term in bath_noise]
+    zeros, unravel = zeros_and_unravel(structs)
 
     def thermal_momentum(key: PRNGKeyArray) -> PyTree[Array]:
         """A momentum with the law of the bath, by steps of the bath alone, which keep this
@@ -183,7 +159,8 @@ def _change_along_step(problem: Problem, dt0: float) -> Float[Array, ""]:
 
         def step_of_bath(number: Array, p: PyTree[Array]) -> PyTree[Array]:
             h = dt0 * 2.0**number
-            increments = _normal_like(controls, jr.fold_in(key, number), jnp.sqrt(h))
+            draws = jr.normal(jr.fold_in(key, number), zeros.shape, zeros.dtype)
+            increments = unravel(jnp.sqrt(h).astype(zeros.dtype) * draws)
             y = p, q0
             noise_change, _ = apply(bath_noise, increments, problem.args, problem.t0, y)
             return after_friction(
@@ -206,72 +183,29 @@ def _change_along_step(problem: Problem, dt0: float) -> Float[Array, ""]:
     return jnp.sqrt(jnp.sum(squared_changes) / jnp.sum(squares))
 
 
-def _normal_like(structs: PyTree, key: PRNGKeyArray, scale: Array) -> PyTree[Array]:
-    """Normal numbers with this standard deviation, in these shapes and dtypes."""
-    leaves, treedef = jtu.tree_flatten(structs)
-    keys = jr.split(key, len(leaves))
-    draws = [
-        scale.astype(leaf.dtype) * jr.normal(leaf_key, leaf.shape, leaf.dtype)
-        for leaf, leaf_key in zip(leaves, keys)
-    ]
-    return treedef.unflatten(draws)
-
-
-def _rates(problem: Problem) -> _Rates:
-    """The rates by power iteration with derivatives of the drift and of the friction."""
-    drift, friction, _ = split_friction(problem.terms)
+@ft.partial(compiled, quickly=True)
+def _friction_rate(problem: Problem) -> Float[Array, ""]:
+    """The largest rate at which friction takes away a momentum at the start."""
+    _, friction, _ = split_friction(problem.terms)
     p0, q0 = problem.y0
-    flat_p, unravel_p = jfu.ravel_pytree(p0)
-    flat_q, unravel_q = jfu.ravel_pytree(q0)
 
-    def friction_force(p: Array) -> Array:
-        y = unravel_p(p), q0
-        force, _ = rate(friction, problem.t0, y, problem.args)
-        return jfu.ravel_pytree(force)[0]
+    def force(t: Array, p: PyTree[Array]) -> PyTree[Array]:
+        return rate(friction, t, (p, q0), problem.args)[0]
 
-    def velocity(p: Array) -> Array:
-        y = unravel_p(p), q0
-        _, dq = rate(drift, problem.t0, y, problem.args)
-        return jfu.ravel_pytree(dq)[0]
-
-    def force(q: Array) -> Array:
-        y = p0, unravel_q(q)
-        dp, _ = rate(drift, problem.t0, y, problem.args)
-        return jfu.ravel_pytree(dp)[0]
-
-    # The derivatives of the equation `dp/dt = force(q) + friction_force(p)`,
-    # `dq/dt = velocity(p)`, each a linear map of changes of `p` or `q`.
-    force_by_p = derivative_at(friction_force, flat_p)
-    velocity_by_p = derivative_at(velocity, flat_p)
-    force_by_q = derivative_at(force, flat_q)
-
-    def second_derivative_of_p(change: Array) -> Array:
-        return force_by_q(velocity_by_p(change))
-
-    def negative_eigenvalue(linear: Callable[[Array], Array]) -> Float[Array, ""]:
-        """The size of the largest eigenvalue if that is negative, and otherwise zero."""
-        # Eigenvalues are real for symmetric masses, friction and stiffness. They are
-        # negative where friction damps, and where the potential is stable.
-        growth = largest_growth(linear, flat_p, _ITERATIONS)
-        return jnp.maximum(-growth.rayleigh_quotient, 0)
-
-    return _Rates(
-        friction=negative_eigenvalue(force_by_p),
-        squared_frequency=negative_eigenvalue(second_derivative_of_p),
-    )
+    force_by_p, flat_p0 = linearized(force, problem.t0, p0)
+    growth = largest_growth(force_by_p, flat_p0, _ITERATIONS)
+    # Eigenvalues are real for symmetric masses and friction, and negative where friction
+    # damps.
+    return jnp.maximum(-growth.rayleigh_quotient, 0)
 
 
+@ft.partial(compiled, quickly=True)
 def _decay(problem: Problem) -> Float[Array, ""]:
     """The rate at which the drift damps the state, at `y0`, in the direction in which it
     changes most; zero if the state grows or oscillates there."""
     drift, _, _ = split_friction(problem.terms)
-    field = drift_field(drift, problem.args)
-    flat_y0, unravel = jfu.ravel_pytree(problem.y0)
-
-    def rate_of_drift(x: Array) -> Array:
-        return field(jnp.asarray(problem.t0), unravel(x))
-
-    derivative = derivative_at(rate_of_drift, flat_y0)
+    field = jtu.Partial(drift_rate, drift, problem.args)
+    derivative, flat_y0 = linearized(field, problem.t0, problem.y0)
     direction = largest_growth(derivative, flat_y0, _ITERATIONS).direction
     once = derivative(direction)
     twice = derivative(once)
@@ -287,8 +221,3 @@ def _decay(problem: Problem) -> Float[Array, ""]:
 def _cosine(x: Float[Array, " n"], y: Float[Array, " n"]) -> Float[Array, ""]:
     """The cosine of the angle between two vectors; NaN if one of them is zero."""
     return x @ y / (jnp.linalg.norm(x) * jnp.linalg.norm(y))
-
-
-_quick_rates = compiled(_rates, quickly=True)
-_quick_change = compiled(_change_along_step, quickly=True)
-_quick_decay = compiled(_decay, quickly=True)

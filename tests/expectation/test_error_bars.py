@@ -124,10 +124,9 @@ def _with_control(shift: float, spread: float = 1.0):
 
     plan = SamplingPlan(
         jax.tree_util.Partial(sampler),
-        Outputs(Layout.of(0.0), levels=1, num_combinations=1, dtype="float64"),
+        Outputs(Layout.of(0.0), levels=1, dtype="float64"),
         num_samples=1000,
         batch_size=250,
-        fields=("value", "plain", "control"),
     )
     return run(plan, KEY, tuple(jax.devices()[:1]))
 
@@ -162,8 +161,9 @@ def test_intervals_cover_as_often_as_they_say(name, noise):
     cell, devices = Cell(noise, 1.0, 1.0, steps=10), tuple(jax.devices()[:1])
     problem = Problem.of(*arguments(cell), None, 1)
     # One fit: its paths have nothing to do with those that are averaged.
-    plan = _FEW[name].prepare(problem, jr.key(1), devices)._replace(rounding_floor=10)
-    ends = [run(plan, jr.key(seed), devices).interval() for seed in range(40)]
+    plan = _FEW[name].prepare(problem, jr.key(1), devices)
+    run_of = lambda seed: run(plan, jr.key(seed), devices, rounding_floor=10)
+    ends = [run_of(seed).interval() for seed in range(40)]
     low, high = np.array(ends).swapaxes(0, 1)
     means, errors = exact(cell, 2**12)
     hits = np.sum((low <= means + errors) & (means - errors <= high), axis=0)

@@ -87,10 +87,10 @@ def test_an_interrupt_between_levels_keeps_the_finished_one(monkeypatch):
     choose = EXPECTATION.choose
     chosen = []
 
-    def interrupted_at_third_level(problem_of, request):
+    def interrupted_at_third_level(*given):
         if chosen:
             raise KeyboardInterrupt
-        chosen.append(choose(problem_of, request))
+        chosen.append(choose(*given))
         return chosen[0]
 
     whole = _mean(512, levels=2)

@@ -96,7 +96,7 @@ def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
     matters = _NEGLIGIBLE_STD_ERRORS * vectors.std_error >= vectors.error
     # Zero where it does not matter.
     heaviness = best.heaviness * matters
-    heaviest = _index_of_largest(heaviness)
+    heaviest = int(np.argmax(np.nan_to_num(heaviness)))
     r = heaviness[heaviest]
     if r > _HEAVY:
         # For sorted paths, `r` is that of the paths of one replicate.
@@ -112,18 +112,15 @@ def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
         )
 
 
-def _index_of_largest(values: np.ndarray) -> int:
-    """The index of the largest of these values, with zero in place of NaN."""
-    return int(np.argmax(np.nan_to_num(values)))
-
-
 def _cautions_on_samples(estimate: Expectation) -> Iterator[str]:
     """Warns of samples that are all zero, or all equal."""
     moments = total(estimate.moments)
     # Without the control variate. With it, a sample is not zero where `phi` is.
     largest_values = moments.size.without_control[Combination.BEST]
     arrays = jtu.tree_leaves(estimate.layout.unravel(largest_values))
-    smallest = _smallest_accurate(estimate.dtype)
+    # The smallest number whose rounding errors do not underflow.
+    precision = jnp.finfo(estimate.dtype)
+    smallest = float(precision.tiny / precision.eps)
     # An array of `phi` must be zero as a whole: a single entry may well be, such as that of
     # a momentum at the start.
     if any(np.max(array) < smallest for array in arrays):
@@ -147,8 +144,8 @@ def _cautions_on_steps(estimate: Expectation) -> Iterator[str]:
     """Warns of two steps whose means differ much. (Three are checked for the order.)"""
     if estimate.levels != 2:
         return
-
     vectors = estimate.vectors
+    best = combined_results(estimate, Combination.BEST)
     change = combined_results(estimate, Combination.EXTRAPOLATION)
     finest = vectors.mean + vectors.bias
     size_of_change = np.abs(change.mean)
@@ -157,14 +154,18 @@ def _cautions_on_steps(estimate: Expectation) -> Iterator[str]:
     size = np.fmax(moments.size.value, moments.size.without_control)[Combination.BEST]
     rounding = ROUNDING * float(jnp.finfo(estimate.dtype).eps) * size
     noise = _STD_ERRORS_TO_BE_SURE * change.std_error
+    # The standard deviation of a path, or for sorted paths a number that is not above it.
+    spread = best.plain_s
+    if estimate.paths_per_sample > 1:
+        spread = least_deviation(best.spread, best.heaviness, estimate.paths_per_sample)
     is_real = size_of_change > np.maximum(noise, rounding)
     is_large = size_of_change > _LARGE_SHARE_OF_MEAN * np.abs(finest)
-    is_seen = size_of_change > _LARGE_SHARE_OF_SPREAD * _spread_of_paths(estimate)
+    is_seen = size_of_change > _LARGE_SHARE_OF_SPREAD * spread
     # The mean may be zero.
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = size_of_change / np.abs(finest)
-    ratios_to_tell = np.where(is_real & is_large & is_seen, ratios, 0)
-    worst = _index_of_largest(ratios_to_tell)
+    ratios_to_tell = np.nan_to_num(np.where(is_real & is_large & is_seen, ratios, 0))
+    worst = int(np.argmax(ratios_to_tell))
     if ratios_to_tell[worst] > 0:
         yield (
             f"The first two steps do not agree{label_of(estimate, worst)}: extrapolation "
@@ -172,17 +173,3 @@ def _cautions_on_steps(estimate: Expectation) -> Iterator[str]:
             f"{finest[worst]:.3g} to {vectors.mean[worst]:.3g}. Pass a smaller `dt0`, or "
             "`levels=3`, which checks the order."
         )
-
-
-def _spread_of_paths(estimate: Expectation) -> np.ndarray:
-    """The standard deviation of the values of a path, or for sorted paths a number that is
-    not above it."""
-    best = combined_results(estimate, Combination.BEST)
-    if estimate.paths_per_sample == 1:
-        return best.plain_s
-    return least_deviation(best.spread, best.heaviness, estimate.paths_per_sample)
-
-
-def _smallest_accurate(dtype: str) -> float:
-    """The smallest number whose rounding errors do not underflow."""
-    return float(jnp.finfo(dtype).tiny / jnp.finfo(dtype).eps)

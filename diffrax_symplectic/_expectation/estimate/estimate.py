@@ -12,23 +12,9 @@ from jaxtyping import PyTree
 
 from ..._arguments import is_real_number
 from ..._simulation import Combination, Layout
-from .error_bars import (
-    is_off_order,
-    largest_if_off_order,
-    remaining_error,
-    Results,
-    results_of,
-)
+from .error_bars import discretization_error, Results, results_of
 from .moments import combined_in_halves, Moments, total
-from .saved import (
-    arrays_of,
-    Contents,
-    fields_from,
-    header_of,
-    OtherVersion,
-    read,
-    write,
-)
+from .saved import contents_of, fields_from, OtherVersion, read, write
 
 
 # NumPy operations on zero-dimensional arrays return scalars.
@@ -66,6 +52,7 @@ class Expectation(eqx.Module):
     # How the numbers of the moments make PyTrees like `phi`, and in which precision they
     # were computed.
     layout: Layout = eqx.field(static=True)
+    levels: int
     dtype: str
     paths_per_sample: int = 1
     # The smallest standard error, in units of the rounding of the mean.
@@ -78,10 +65,6 @@ class Expectation(eqx.Module):
     # What tells this estimate from those of other arguments, by the names of these.
     digests: dict[str, str] | None = None
     ts: np.ndarray | None = None
-
-    @property
-    def levels(self) -> int:
-        return len(self.moments[0].failed_on)
 
     @property
     def num_samples(self) -> int:
@@ -251,7 +234,7 @@ class Expectation(eqx.Module):
         $\\phi$ must be made of dictionaries, lists, tuples and arrays. Functions in
         `sampling`, such as `sort_by`, are not saved."""
         _check_file(file, "write")
-        write(file, Contents(header_of(self), arrays_of(self)))
+        write(file, *contents_of(self))
 
     @staticmethod
     def load(file: str | Path | BinaryIO) -> "Expectation":
@@ -266,7 +249,7 @@ class Expectation(eqx.Module):
             with open(file, "rb") as opened:
                 return Expectation.load(opened)
         try:
-            return Expectation(**fields_from(read(file)))
+            return Expectation(**fields_from(*read(file)))
         except OtherVersion:
             raise
         except Exception:
@@ -278,8 +261,7 @@ class Expectation(eqx.Module):
 
     def __str__(self) -> str:
         lines = self._lines_of_means()
-        # Only trials, which no user sees, have no sampling.
-        if self.levels == 1 and self.sampling is not None:
+        if self.levels == 1:
             lines.append("not included: the discretization error (see `levels`)")
         if self.vectors.is_off_order:
             lines.append(
@@ -287,16 +269,14 @@ class Expectation(eqx.Module):
                 "is taken for the error (take smaller steps)"
             )
         plural = "" if self.levels == 1 else "s"
-        counts = (
+        # With `tol` the size of the sampling is an upper limit, which tells nothing.
+        sampling = self.sampling
+        if self.tol_reached is not None:
+            sampling = f"{type(self.sampling).__name__} until `tol`"
+        lines.append(
             f"{self.num_paths:,} paths on {self.levels} level{plural}, "
-            f"{self.num_failed:,} failed"
+            f"{self.num_failed:,} failed, {sampling}"
         )
-        if self.tol_reached is not None and self.sampling is not None:
-            # With `tol` the size of the sampling is an upper limit, which tells nothing.
-            counts += f", {type(self.sampling).__name__} until `tol`"
-        elif self.sampling is not None:
-            counts += f", {self.sampling}"
-        lines.append(counts)
         if self.reason:
             lines.append(self.reason)
         if self.caveat:
@@ -332,17 +312,33 @@ class Expectation(eqx.Module):
     @property
     def vectors(self) -> "Vectors":
         """All results, each as a vector of all numbers of `phi`."""
-        return _vectors_of(self)
+        results = _results_of(self)
+        best = results.of_combination(Combination.BEST)
+        num_drawn = sum(part.end - part.begin for part in self.moments)
+        # A sample of one path is left out if the path fails. A replicate leaves out its
+        # failed paths, which are counted here as a fraction of a sample.
+        num_left_out = num_drawn - self.num_samples
+        num_lost = max(num_left_out, self.num_failed / self.paths_per_sample)
+        fraction = num_lost / max(num_drawn, 1) if self.num_samples > 0 else np.nan
+        vectors = Vectors(
+            best.mean, best.std_error, best.variance, fraction * best.spread
+        )
+        if self.levels == 1:
+            return vectors
+        error, off_order = discretization_error(results, self.levels)
+        return vectors._replace(
+            bias=results.mean[Combination.BIAS],
+            bias_std_error=results.std_error[Combination.BIAS],
+            discretization_error=error,
+            off_order=off_order,
+        )
 
     def _tree(self, x: np.ndarray | None) -> Any:
         """The numbers of a vector in the structure of `phi`; `None` for `None`."""
         if x is None:
             return None
-
-        def scalar_or_array(leaf: np.ndarray) -> np.ndarray | np.floating:
-            return leaf[()]
-
-        return jtu.tree_map(scalar_or_array, self.layout.unravel(x))
+        # This turns arrays without axes into numbers.
+        return jtu.tree_map(lambda leaf: leaf[()], self.layout.unravel(x))
 
 
 class Vectors(NamedTuple):
@@ -372,43 +368,6 @@ class Vectors(NamedTuple):
         return self.off_order is not None and bool(np.any(self.off_order))
 
 
-def _vectors_of(estimate: Expectation) -> Vectors:
-    results = _results_of(estimate)
-    best = results.of_combination(Combination.BEST)
-    num_drawn = sum(part.end - part.begin for part in estimate.moments)
-    # A sample of one path is left out if the path fails. A replicate leaves out its failed
-    # paths, which are counted here as a fraction of a sample.
-    num_left_out = num_drawn - estimate.num_samples
-    num_lost = max(num_left_out, estimate.num_failed / estimate.paths_per_sample)
-    fraction = num_lost / max(num_drawn, 1) if estimate.num_samples > 0 else np.nan
-    vectors = Vectors(best.mean, best.std_error, best.variance, fraction * best.spread)
-    if estimate.levels == 1:
-        return vectors
-    extrapolation = results.of_combination(Combination.EXTRAPOLATION)
-    bias = results.of_combination(Combination.BIAS)
-    vectors = vectors._replace(
-        bias=bias.mean,
-        bias_std_error=bias.std_error,
-        discretization_error=np.abs(extrapolation.mean),
-    )
-    if estimate.levels == 2:
-        return vectors
-    by_first_power = results.of_combination(Combination.BY_FIRST_POWER)
-    last = results.of_combination(Combination.LAST)
-    before = results.of_combination(Combination.BEFORE)
-    miss = results.of_combination(Combination.MISS)
-    size = remaining_error(
-        extrapolation.mean, by_first_power.mean, by_first_power.std_error
-    )
-    off_order = is_off_order(last.mean, miss.mean, miss.std_error)
-    return vectors._replace(
-        discretization_error=largest_if_off_order(
-            off_order, size, last.mean, before.mean
-        ),
-        off_order=off_order,
-    )
-
-
 def _results_of(estimate: Expectation) -> Results:
     """The results for all combinations of levels."""
     return results_of(total(estimate.moments), estimate.dtype, estimate.rounding_floor)
@@ -431,7 +390,13 @@ def check_same(one: Expectation, other: Expectation, name: str) -> None:
     """Raises a `ValueError` if the estimates come from different arguments, have different
     keys or shapes, or numbers of paths in a sample. `name` is what messages call one of
     them, such as "`start`"."""
-    different = _different_arguments(one.digests or {}, other.digests or {})
+    # Among the arguments that both estimates know.
+    digests = other.digests or {}
+    different = [
+        f"`{argument}`"
+        for argument, value in (one.digests or {}).items()
+        if digests.get(argument, value) != value
+    ]
     if different:
         raise ValueError(
             f"{name} was computed with another {' and another '.join(different)}. Parts of "
@@ -443,9 +408,7 @@ def check_same(one: Expectation, other: Expectation, name: str) -> None:
             f"{name} has another `key`. Pass the same `key` for all parts of an "
             "estimate."
         )
-    num_combinations = one.moments[0].mean.value.shape
-    other_num_combinations = other.moments[0].mean.value.shape
-    if one.layout != other.layout or num_combinations != other_num_combinations:
+    if one.layout != other.layout or one.levels != other.levels:
         raise ValueError(
             f"{name} has another structure or other shapes. Pass one from the same "
             "function, times and levels."
@@ -457,15 +420,6 @@ def check_same(one: Expectation, other: Expectation, name: str) -> None:
             f"{other.paths_per_sample:,} in the other. Pass the same `sampling` for all "
             "parts of an estimate."
         )
-
-
-def _different_arguments(one: dict[str, str], other: dict[str, str]) -> list[str]:
-    """The names of arguments that differ, among those that both estimates know."""
-    return [
-        f"`{name}`"
-        for name, value in one.items()
-        if name in other and other[name] != value
-    ]
 
 
 def label_of(estimate: Expectation, place: int) -> str:

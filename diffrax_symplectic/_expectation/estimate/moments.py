@@ -62,14 +62,10 @@ def total(parts: tuple[Moments, ...]) -> Moments:
 
 def _are_halves(a: Moments, b: Moments) -> bool:
     """Whether `a` and then `b` are the halves of a range that begins at a multiple of its
-    length, as samples 8 to 11 and 12 to 15 are. (If `a` has no samples, it counts as such a
-    half with any part that follows it.)"""
+    length, as samples 8 to 11 and 12 to 15 are."""
     length = a.end - a.begin
-    if a.end != b.begin:
-        return False
-    if length == 0:
-        return True
-    return b.end - b.begin == length and (a.begin // length) % 2 == 0
+    is_next = a.end == b.begin and b.end - b.begin == length
+    return is_next and (a.begin // length) % 2 == 0
 
 
 @np.errstate(over="ignore", invalid="ignore", under="ignore")
@@ -84,7 +80,7 @@ def _moments_of_both(a: Moments, b: Moments) -> Moments:
     difference = jtu.tree_map(np.subtract, b.mean, a.mean)
 
     def mean(of_a, of_b, difference):
-        # Without samples the mean of `a` is a placeholder.
+        # Without good samples the mean of `a` is a placeholder.
         return of_b if a.num_good == 0 else of_a + difference * share_of_b
 
     def norm(of_a, of_b, difference):

@@ -21,18 +21,24 @@ _STD_ERRORS_BY_CHANCE = 2
 def is_reached(estimate: Expectation, tol: float) -> bool:
     """Whether the whole error of each mean is small enough, and can be trusted."""
     vectors = estimate.vectors
-    return _all_within(vectors.error, tol) and not vectors.is_off_order
+    return bool(np.all(vectors.error <= tol)) and not vectors.is_off_order
 
 
 def is_stuck(estimate: Expectation, tol: float) -> bool:
     """Whether more samples would not reach the tolerance."""
     vectors = estimate.vectors
-    if vectors.is_off_order or _is_discretization_beyond(estimate, tol):
+    if vectors.is_off_order:
         return True
+    if vectors.discretization_error is not None:
+        # This error is the change by the last extrapolation.
+        change = combined_results(estimate, Combination.EXTRAPOLATION)
+        noise = _STD_ERRORS_BY_CHANCE * change.std_error
+        if np.any(vectors.discretization_error - noise > tol):
+            return True
     # If the standard error is small, the rest of the error comes from the step or from
     # failed paths.
-    has_enough_samples = _all_within(vectors.std_error, _SHARE_OF_TOLERANCE * tol)
-    return has_enough_samples and not _all_within(vectors.error, tol)
+    has_enough_samples = np.all(vectors.std_error <= _SHARE_OF_TOLERANCE * tol)
+    return bool(has_enough_samples and not np.all(vectors.error <= tol))
 
 
 def is_bounded_by_steps(estimate: Expectation) -> bool:
@@ -41,18 +47,15 @@ def is_bounded_by_steps(estimate: Expectation) -> bool:
     vectors = estimate.vectors
     if vectors.discretization_error is None or estimate.num_failed > 0:
         return False
-    return bool(
-        np.all(
-            vectors.std_error <= _SHARE_OF_DISCRETIZATION * vectors.discretization_error
-        )
-    )
+    small_part = _SHARE_OF_DISCRETIZATION * vectors.discretization_error
+    return bool(np.all(vectors.std_error <= small_part))
 
 
 def needs_level(estimate: Expectation, tol: float) -> bool:
     """Whether another level, of half the step, may reach the tolerance."""
     if is_reached(estimate, tol) or not is_stuck(estimate, tol):
         return False
-    return _all_within(estimate.vectors.failed_error, tol)
+    return bool(np.all(estimate.vectors.failed_error <= tol))
 
 
 def share_of_needed(estimate: Expectation, tol: float | None) -> float:
@@ -104,17 +107,3 @@ def shortfall(estimate: Expectation, tol: float) -> str:
 def largest_error(errors: np.ndarray | None) -> float:
     """The largest of these errors, or zero if there is none."""
     return 0.0 if errors is None else float(np.max(errors, initial=0.0))
-
-
-def _all_within(errors: np.ndarray, tol: float) -> bool:
-    return bool(np.all(errors <= tol))
-
-
-def _is_discretization_beyond(estimate: Expectation, tol: float) -> bool:
-    """Whether the discretization error alone exceeds the tolerance, beyond its noise."""
-    error = estimate.vectors.discretization_error
-    if error is None:
-        return False
-    # The discretization error is the change by the last extrapolation.
-    noise = combined_results(estimate, Combination.EXTRAPOLATION).std_error
-    return bool(np.any(error - _STD_ERRORS_BY_CHANCE * noise > tol))

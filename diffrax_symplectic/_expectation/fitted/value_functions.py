@@ -115,7 +115,6 @@ class ValueFunctions(AbstractSampling):
                 outputs,
                 num_samples=num_samples,
                 batch_size=self.batch_size,
-                fields=("value", "plain", "control"),
                 # These few paths take less time than compiling their program.
                 is_quick=True,
             )

@@ -143,7 +143,6 @@ class ArrayRQMC(AbstractSampling):
                 num_samples=self.replicates,
                 # All paths of a replicate are solved at once, which is a batch already.
                 batch_size=1,
-                fields=("value", "heaviness", "largest"),
                 paths_per_sample=self.num_paths,
                 least_samples=_LEAST_REPLICATES,
             )
