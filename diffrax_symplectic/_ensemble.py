@@ -205,7 +205,7 @@ def ensemble(
     batch_size = min(whole_number("batch_size", batch_size), num_paths)
     batches = _simulated_batches(problem, key, engine, num_paths, batch_size)
     whole = _concatenated(batches, num_paths, at_end=ts is None)
-    advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
+    advice = advice_on_failures(problem)
     _warn_of_failures(whole, advice)
     # The times at which steps end. (Those in `ts` may differ from them by rounding.)
     saved_steps = np.asarray(problem.levels.saved_steps[0])

@@ -255,7 +255,7 @@ def _messages_on_result(
     lost_numbers = out_of_range(problem, most_fail)
     if lost_numbers is not None and most_fail:
         return [*cautions(estimate, tol, advice=lost_numbers)]
-    advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
+    advice = advice_on_failures(problem)
     if most_fail:
         advice = _advice_on_long_steps(problem, dt0) + advice
     messages = [
@@ -269,10 +269,9 @@ def _messages_on_result(
 def _advice_on_long_steps(problem: Problem, dt0: float) -> str:
     """Which steps to take where most paths fail because they are too long; empty if they
     are not."""
-    any_steps = problem.with_any_steps()
-    if not may_be_too_long(any_steps):
+    if not may_be_too_long(problem):
         return ""
-    shorter = dt0 / max(4, unresolved_angle(any_steps) or 0)
+    shorter = dt0 / max(4, unresolved_angle(problem) or 0)
     return (
         f"Most likely, steps of `dt0={dt0:g}` are too long for "
         f"`{type(problem.solver).__name__}`: pass `dt0={shorter:.2g}` or less, or an "
@@ -301,7 +300,7 @@ def _checked(
     """What is wrong with the steps, and with discrete increments, by looks at the problem
     and by trials."""
     problem, _, plan = decision
-    messages = messages_on_steps(problem.with_any_steps(), dt0)
+    messages = messages_on_steps(problem, dt0)
     caveat = ""
     # A trial takes longer than these looks, which name the cause.
     if estimate.levels == 2 and not messages:

@@ -86,7 +86,7 @@ def trial_with_finer_level(
         return Trial()
     key = trial_key(key)
     is_fitted = isinstance(estimate.sampling, ValueFunctions)
-    angle = unresolved_angle(problem.with_any_steps())
+    angle = unresolved_angle(problem)
     has_same_sampling = plan.with_halved_steps is not None and (
         is_fitted or angle is None
     )

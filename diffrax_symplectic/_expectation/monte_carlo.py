@@ -151,7 +151,7 @@ def monte_carlo(
         estimate = run(
             plan, key, devices, sampling, start, first, tol, progress, kept=kept
         )
-        advice = advice_on_failures(has_bounded_increments=False, is_implicit=False)
+        advice = advice_on_failures(None)
         for message in cautions(estimate, tol, advice):
             warnings.warn(message, stacklevel=2)
     return estimate

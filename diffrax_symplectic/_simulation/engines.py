@@ -22,13 +22,13 @@ from .._fused import (
     functions_and_arrays,
     Kernels,
     Lanes,
-    PathFunctions,
     sample_key,
     Shared,
 )
 from .._lapack import lapack_in_turn
 from .._programs import compiled
 from .._stablehlo import NotReplayed, source_lines
+from .layout import Layout
 from .levels import Level
 from .loop import values_of_paths
 from .problem import Problem
@@ -81,7 +81,7 @@ def by_jax(
     """The paths with these sample numbers on one level, simulated by JAX. The loop is that
     of `expectation`, which runs all levels of the problem: the others are dropped."""
     high, low = _words(sample_numbers)
-    states_and_failed = _paths_by_jax(problem.with_any_steps(), key, high, low)
+    states_and_failed = _paths_by_jax(problem, key, high, low)
     # The results are traced if a function of the user closes over traced values.
     check_untraced("`ensemble`", states_and_failed)
     y, failed = jax.device_get(states_and_failed)
@@ -156,50 +156,34 @@ def _fused_batch(
     failed."""
     kernels, lanes, shared = fused_start(problem, key, sample_numbers, level)
     saved_steps = np.asarray(problem.level(level).saved_steps)
-    # By the number of steps before a saved time: an array (paths,) for each entry of the
-    # state. The kernel is called once for all steps from one saved time to the next.
-    entries_after: dict[int, list[np.ndarray]] = {}
+    # By the number of steps before a saved time: (paths, entries of the state). The kernel
+    # is called once for all steps from one saved time to the next.
+    states_after: dict[int, np.ndarray] = {}
     num_steps_done = 0
     for num_steps in np.unique(saved_steps).tolist():
         # There is no step to take if the saved time is `t0`.
         if num_steps > num_steps_done:
             lanes = kernels.advance(lanes, shared, num_steps_done, num_steps)
         num_steps_done = num_steps
-        entries_after[num_steps] = [np.asarray(entry) for entry in lanes.y]
-    # An array (paths, times) for each entry. `ts` may repeat a time.
-    entries = [
-        np.stack([entries_after[step][k] for step in saved_steps.tolist()], axis=1)
-        for k in range(len(lanes.y))
-    ]
+        states_after[num_steps] = np.stack([*map(np.asarray, lanes.y)], axis=-1)
+    # (paths, times, entries of the state). `ts` may repeat a time.
+    states = np.stack([states_after[step] for step in saved_steps.tolist()], axis=1)
     # A copy, so that no array of Dr.Jit outlives this call, during which no other thread
     # uses Dr.Jit.
     is_unfinished = np.array(lanes.stopped)
     return Batch(
-        y=_states_of_entries(problem.y0, entries),
+        y=Layout.of(problem.y0).unravel(states),
         failed=is_unfinished,
         num_stragglers=int(np.sum(is_unfinished)),
     )
 
 
-class FusedStart(NamedTuple):
-    """The paths of a batch before their first step.
-
-    - `kernels`: what takes their steps, by
-        `kernels.advance(lanes, shared, first_step, end_step)`.
-    - `lanes`: what differs between paths.
-    - `shared`: what all paths share.
-    """
-
-    kernels: Kernels
-    lanes: Lanes
-    shared: Shared
-
-
 def fused_start(
     problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
-) -> FusedStart:
-    """The paths with these sample numbers before their first step, and the kernels of the
-    problem, which are compiled unless they are known."""
+) -> tuple[Kernels, Lanes, Shared]:
+    """The kernels of the problem, which are compiled unless they are known; what differs
+    between the paths with these sample numbers before their first step, and what they
+    share. `kernels.advance(lanes, shared, first_step, end_step)` takes their steps."""
     example_args = None
     if problem.args_of is not None:
         example_args = eqx.filter(problem.args, eqx.is_array)
@@ -222,7 +206,7 @@ def fused_start(
         y0=y0,
         own_args=own_args,
     )
-    return FusedStart(kernels, lanes, shared)
+    return kernels, lanes, shared
 
 
 def _compiled_problem(problem: Problem) -> Problem:
@@ -244,14 +228,11 @@ def _compiled_problem(problem: Problem) -> Problem:
         levels=level,
         weights=jnp.ones((1, 1)),
         at_end=True,
-        most_steps=1,
     )
 
 
 # A kernel keeps all that the user's functions capture, so only a few kernels are kept.
-@ft.lru_cache(maxsize=8)
-def _kernels(functions: PathFunctions) -> Kernels:
-    return Kernels(functions)
+_kernels = ft.lru_cache(maxsize=8)(Kernels)
 
 
 def _with_stragglers(
@@ -283,24 +264,6 @@ def _with_stragglers(
     failed = with_solved(fused.failed, solved.failed)
     y = jtu.tree_map(with_solved, fused.y, solved.y)
     return Batch(y, failed, num_stragglers)
-
-
-def _states_of_entries(y0: PyTree, entries: list[np.ndarray]) -> PyTree[np.ndarray]:
-    """States in the structure of `y0`, with leading axes for paths and times, from an array
-    (paths, times) for each of their entries."""
-    leaves, treedef = jtu.tree_flatten(y0)
-    remaining_entries = iter(entries)
-    paths_and_times = entries[0].shape
-    state_leaves = []
-    for leaf in leaves:
-        leaf_entries = [next(remaining_entries) for _ in range(leaf.size)]
-        if leaf_entries:
-            stacked = np.stack(leaf_entries, axis=-1)
-        else:
-            # An empty array has no entries to stack.
-            stacked = np.zeros((*paths_and_times, 0), leaf.dtype)
-        state_leaves.append(stacked.reshape(*paths_and_times, *leaf.shape))
-    return treedef.unflatten(state_leaves)
 
 
 def _refusal(error: BaseException | None) -> ValueError | None:

@@ -8,6 +8,7 @@ import numpy as np
 from ..._arguments import whole_number
 from ..._simulation import Problem
 from .bases import AbstractBasis, Hermite, Quadratic
+from .fits import room_for_steps
 from .grid import Grid
 from .noise import Noise
 from .polynomials import num_polynomials
@@ -66,7 +67,7 @@ def chosen_basis(problem: Problem, degree: int | None) -> ChosenBasis:
     d = problem.num_components
     num_outputs = math.prod(problem.output_shape)
     # In a fit: for all levels, steps, times and components.
-    num_functions = len(problem.levels.h) * problem.most_steps * num_outputs
+    num_functions = len(problem.levels.h) * room_for_steps(problem) * num_outputs
 
     def with_cost(basis: AbstractBasis) -> ChosenBasis:
         num_states = basis.num_sites * num_nodes

@@ -15,6 +15,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from ..._custom_types import Y
+from ..._lapack import lapack_in_turn
+from ..._programs import compiled
 from ..._simulation import PathStates, Problem, ravel
 from .bases import AbstractBasis, equal_weights, Target
 from .noise import cuts_of, Noise
@@ -63,15 +65,31 @@ class FittedFunctions(eqx.Module):
         )
 
 
+def room_for_steps(problem: Problem) -> int:
+    """The number of steps for which the arrays of a fit have room, on any level: their
+    shapes must be known when compiling."""
+    # With two levels a trial halves all steps.
+    most = problem.finest_steps * (2 if len(problem.levels.h) == 2 else 1)
+    # Powers of two, so that most other numbers of steps compile nothing anew.
+    return 1 << (most - 1).bit_length()
+
+
+@ft.partial(compiled, quickly=True)
+@lapack_in_turn
 def fit(
-    noise: Noise, key: PRNGKeyArray, basis: AbstractBasis
+    problem: Problem,
+    index: Int[Array, ""],
+    key: PRNGKeyArray,
+    basis: AbstractBasis,
+    most_steps: int,
 ) -> tuple[FittedFunctions, Int[Array, ""]]:
-    """The functions of a level, by a pilot run forward in time and fits backward; and how
-    many of the pilot's paths failed."""
-    problem = noise.problem
+    """The functions of the level with this index, with a leading axis of levels, by a pilot
+    run forward in time and fits backward; and how many of the pilot's paths failed. All
+    levels have arrays for `most_steps` steps, so that they share a program."""
+    noise = Noise.of(problem, problem.level(index))
     num_steps = noise.level.num_steps
-    keys = jr.split(key, basis.num_pilots)
-    starts, states, good = _run_pilot(noise, keys)
+    keys = jr.split(jr.fold_in(key, index), basis.num_pilots)
+    starts, states, good = _run_pilot(noise, keys, most_steps)
     scales = _scales(problem, starts, states, good, num_steps)
 
     def frame_after(i: Any) -> PyTree[Array]:
@@ -90,14 +108,13 @@ def fit(
             coefficients=put_step(fitted.coefficients, coefficients),
         )
 
-    # All levels have arrays for the same number of steps, so that they share a program.
     def zeros_for_all_steps(of_step: jax.ShapeDtypeStruct) -> Array:
-        return jnp.zeros((problem.most_steps, *of_step.shape), of_step.dtype)
+        return jnp.zeros((most_steps, *of_step.shape), of_step.dtype)
 
     shape = (basis.size, len(basis.candidates), *problem.output_shape)
     unfitted = FittedFunctions(
         frames=jtu.tree_map(zeros_for_all_steps, jax.eval_shape(frame_after, 0)),
-        coefficients=jnp.zeros((problem.most_steps, *shape), problem.dtype),
+        coefficients=jnp.zeros((most_steps, *shape), problem.dtype),
         second_derivatives=None,
         basis=basis,
     )
@@ -116,12 +133,12 @@ def fit(
     # The states before each step are those after the step before: (steps, paths, d).
     states_before = jnp.concatenate([starts[None], states[:-1]])
     steps_and_states = (
-        jnp.arange(problem.most_steps),
+        jnp.arange(most_steps),
         states_before[:, :_STATES_FOR_SECOND],
     )
     second_derivatives = lax.map(second_derivatives_of_step, steps_and_states)
     functions = dataclasses.replace(fitted, second_derivatives=second_derivatives)
-    return functions, jnp.sum(~good)
+    return jtu.tree_map(lambda x: x[None], functions), jnp.sum(~good)
 
 
 def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
@@ -141,9 +158,9 @@ def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
         y = unravel(flat_y)
         variables = None
         if key is not None:
-            # Draws by one key are numbered. The pilot's own steps have the numbers below
-            # `most_steps`.
-            number = problem.most_steps + i
+            # Draws by one key are numbered. The pilot's own steps have the numbers of the
+            # steps for which there is room.
+            number = len(fitted.coefficients) + i
             cuts = cuts_of([law.probabilities for law in noise.laws])
             variables, _ = noise.draw(key, number, cuts)
         # (C, S, m), and `phi` (m).
@@ -159,7 +176,7 @@ def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
 
 
 def _run_pilot(
-    noise: Noise, keys: Key[Array, " paths"]
+    noise: Noise, keys: Key[Array, " paths"], most_steps: int
 ) -> tuple[
     Float[Array, "paths d"], Float[Array, "steps paths d"], Bool[Array, " paths"]
 ]:
@@ -193,7 +210,7 @@ def _run_pilot(
         problem, jax.vmap(problem.draw_start)(keys), solver_state=None
     )
     starts = jax.vmap(ravel)(paths.y)
-    states = jnp.broadcast_to(starts, (problem.most_steps, *starts.shape))
+    states = jnp.broadcast_to(starts, (most_steps, *starts.shape))
     carry = paths, states
     paths, states = lax.fori_loop(0, noise.level.num_steps, step_all, carry)
     return starts, states, ~paths.failed

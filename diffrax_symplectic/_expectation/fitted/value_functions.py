@@ -10,16 +10,15 @@ import functools as ft
 import warnings
 from collections.abc import Sequence
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Int, PRNGKeyArray
 
 from ..._arguments import check_memory, check_untraced, whole_number
-from ..._lapack import lapack_in_turn
-from ..._programs import compiled
 from ..._simulation import Combination, Problem
 from ..._solver import has_newton, without_newton
 from ..estimate import combined_results, Expectation
@@ -34,9 +33,8 @@ from ..sampling import (
 from .bases import AbstractBasis
 from .basis_choice import chosen_basis
 from .controlled_paths import controlled_paths
-from .fits import fit, FittedFunctions
+from .fits import fit, FittedFunctions, room_for_steps
 from .mixture import Mixture
-from .noise import Noise
 
 
 # Folded into the key of a call to draw trials. (Numbers of levels, which are folded into it
@@ -109,7 +107,8 @@ class ValueFunctions(AbstractSampling):
             )
         basis = chosen.basis
         outputs = Outputs.of(problem)
-        functions = _fits(problem, key, basis, range(len(problem.levels.h)))
+        levels = range(len(problem.levels.h))
+        functions = _fits(problem, key, basis, room_for_steps(problem), levels)
         mixture = Mixture.of(problem)
 
         def plan_for(
@@ -173,8 +172,10 @@ def _with_halved_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
     fitted: each other level now has the steps of the one after it, and takes its fit."""
     problem, functions, *others = plan.sampler.args  # pyright: ignore (a `Partial`)
     finer_problem = problem.with_halved_steps()
-    last_level = len(problem.levels.h) - 1
-    last_functions = _fits(finer_problem, key, functions.basis, [last_level])
+    num_levels, most_steps, *_ = functions.coefficients.shape
+    last_functions = _fits(
+        finer_problem, key, functions.basis, most_steps, [num_levels - 1]
+    )
     known_functions = jtu.tree_map(lambda x: x[1:], functions)
     finer_functions = _joined([known_functions, last_functions])
     sampler = jtu.Partial(controlled_paths, finer_problem, finer_functions, *others)
@@ -204,30 +205,31 @@ def _comparison(
 
 
 def _fits(
-    problem: Problem, key: PRNGKeyArray, basis: AbstractBasis, levels: Sequence[int]
+    problem: Problem,
+    key: PRNGKeyArray,
+    basis: AbstractBasis,
+    most_steps: int,
+    levels: Sequence[int],
 ) -> FittedFunctions:
-    """The fits of levels with these numbers."""
+    """The fits of levels with these numbers, in arrays for `most_steps` steps."""
+
+    def fits_by(solver: diffrax.AbstractSolver) -> tuple[FittedFunctions, int]:
+        """The fits by this solver, and how many of the pilot's paths failed."""
+        solved = dataclasses.replace(problem, solver=solver)
+        # An integer would be static: a program for each level.
+        fits = [fit(solved, np.array(k), key, basis, most_steps) for k in levels]
+        functions_of_levels, failures_of_levels = zip(*fits)
+        # The numbers are traced if a function of the user closes over traced values.
+        check_untraced("`expectation`", failures_of_levels)
+        return _joined(functions_of_levels), sum(map(int, failures_of_levels))
+
     # Newton's method is a quarter of the time to compile a fit, and few of its states need
     # it. A state at which the sweeps fail is left out of the fit. But if paths of the pilot
     # fail, steps are too long for sweeps: the fit is made again, with Newton's method.
-    sweeps_only = dataclasses.replace(problem, solver=without_newton(problem.solver))
-    functions, num_failed = _fits_and_failures(sweeps_only, key, basis, levels)
+    functions, num_failed = fits_by(without_newton(problem.solver))
     if num_failed > 0 and has_newton(problem.solver):
-        functions, _ = _fits_and_failures(problem, key, basis, levels)
+        functions, _ = fits_by(problem.solver)
     return functions
-
-
-def _fits_and_failures(
-    problem: Problem, key: PRNGKeyArray, basis: AbstractBasis, levels: Sequence[int]
-) -> tuple[FittedFunctions, int]:
-    """The fits of levels, and how many of the pilot's paths failed."""
-    # An integer would be static: a program for each level. Its shape keeps the axis of
-    # levels, along which the fits are joined.
-    fits = [_fit_of_level(problem, np.array([k]), key, basis) for k in levels]
-    functions_of_levels, failures_of_levels = zip(*fits)
-    # The numbers are traced if a function of the user closes over traced values.
-    check_untraced("`expectation`", failures_of_levels)
-    return _joined(functions_of_levels), sum(map(int, failures_of_levels))
 
 
 def _joined(functions_of_levels: Sequence[FittedFunctions]) -> FittedFunctions:
@@ -235,16 +237,3 @@ def _joined(functions_of_levels: Sequence[FittedFunctions]) -> FittedFunctions:
     if len(functions_of_levels) == 1:
         return functions_of_levels[0]
     return jtu.tree_map(lambda *xs: jnp.concatenate(xs), *functions_of_levels)
-
-
-@ft.partial(compiled, quickly=True)
-@lapack_in_turn
-def _fit_of_level(
-    problem: Problem, index: Int[Array, "1"], key: PRNGKeyArray, basis: AbstractBasis
-) -> tuple[FittedFunctions, Int[Array, ""]]:
-    """The fit of the level with this index, with a leading axis of levels, and how many of
-    the pilot's paths failed."""
-    level = problem.level(index[0])
-    key_of_level = jr.fold_in(key, index[0])
-    functions, num_failed = fit(Noise.of(problem, level), key_of_level, basis)
-    return jtu.tree_map(lambda x: x[None], functions), num_failed
