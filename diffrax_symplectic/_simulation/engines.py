@@ -7,14 +7,14 @@ import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Key, PRNGKeyArray, PyTree, UInt32
 
 from .._arguments import check_untraced
 from .._fused import (
@@ -58,10 +58,6 @@ def warn_of_stragglers(
         )
 
 
-# The high or the low 32 bits of each of several sample numbers, which have 64 bits.
-_Words: TypeAlias = Array | np.ndarray
-
-
 class Batch(NamedTuple):
     """Paths along the first axis of each array, saved times along the second.
 
@@ -80,46 +76,47 @@ def by_jax(
 ) -> Batch:
     """The paths with these sample numbers on one level, simulated by JAX. The loop is that
     of `expectation`, which runs all levels of the problem: the others are dropped."""
-    high, low = _words(sample_numbers)
-    states_and_failed = _paths_by_jax(problem, key, high, low)
+    states_and_failed = _paths_by_jax(problem, key, _words(sample_numbers))
     # The results are traced if a function of the user closes over traced values.
     check_untraced("`ensemble`", states_and_failed)
     y, failed = jax.device_get(states_and_failed)
     return Batch(jtu.tree_map(lambda x: x[level], y), failed[level])
 
 
-def _words(sample_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _words(sample_numbers: np.ndarray) -> UInt32[np.ndarray, "2 n"]:
     """The high and the low 32 bits of 64-bit numbers."""
     high = sample_numbers >> np.uint64(32)
     low = sample_numbers & np.uint64(0xFFFFFFFF)
-    return high.astype(np.uint32), low.astype(np.uint32)
+    return np.stack([high, low]).astype(np.uint32)
 
 
-def _sample_keys(key: PRNGKeyArray, high: _Words, low: _Words) -> Array:
+def _sample_keys(
+    key: PRNGKeyArray, words: UInt32[Array | np.ndarray, "2 n"]
+) -> Key[Array, " n"]:
     """The random keys of the samples with these numbers."""
-    return jax.vmap(ft.partial(sample_key, key))(high, low)
+    return jax.vmap(ft.partial(sample_key, key))(*words)
 
 
 @compiled
 def _draw_starts(
-    problem: Problem, key: PRNGKeyArray, high: _Words, low: _Words
+    problem: Problem, key: PRNGKeyArray, words: UInt32[Array | np.ndarray, "2 n"]
 ) -> tuple[PyTree, PyTree]:
     """`Problem.draw_start` for the paths of a batch."""
-    return jax.vmap(problem.draw_start)(_sample_keys(key, high, low))
+    return jax.vmap(problem.draw_start)(_sample_keys(key, words))
 
 
 @compiled
 @lapack_in_turn
 def _paths_by_jax(
-    problem: Problem, key: PRNGKeyArray, high: _Words, low: _Words
+    problem: Problem, key: PRNGKeyArray, words: UInt32[Array | np.ndarray, "2 n"]
 ) -> tuple[PyTree[Array], Bool[Array, "levels n"]]:
     """The saved states of the paths of a batch, along axes of levels, paths and times, and
     which paths failed."""
     # (levels, times, paths, entries of the state)
-    states, failed = values_of_paths(problem, _sample_keys(key, high, low))
+    states, failed = values_of_paths(problem, _sample_keys(key, words))
     # (levels, paths, times, entries of the state)
     states = jnp.swapaxes(states, 1, 2)
-    return problem.unravel(states), failed
+    return Layout.of(problem.y0).unravel(states), failed
 
 
 def by_drjit(
@@ -184,19 +181,30 @@ def fused_start(
     """The kernels of the problem, which are compiled unless they are known; what differs
     between the paths with these sample numbers before their first step, and what they
     share. `kernels.advance(lanes, shared, first_step, end_step)` takes their steps."""
+    # Kernels have plain sweeps for root finders. Step sizes, times and numbers of steps are
+    # inputs of a kernel, which is compiled for placeholders.
+    zero = jnp.zeros(1, jnp.int32)
+    any_h = jnp.ones_like(problem.levels.h[:1])
+    compiled_problem = dataclasses.replace(
+        problem,
+        solver=by_sweeps_alone(problem.solver),
+        y0_of=None,
+        args_of=None,
+        levels=Level(index=zero, h=any_h, num_steps=zero, saved_steps=zero[None]),
+        weights=jnp.ones((1, 1)),
+        at_end=True,
+    )
     example_args = None
     if problem.args_of is not None:
         example_args = eqx.filter(problem.args, eqx.is_array)
     functions, arrays = functions_and_arrays(
-        _compiled_problem(problem), key, example_args, problem.paths_differ
+        compiled_problem, key, example_args, problem.paths_differ
     )
     kernels = _kernels(functions)
+    y0 = problem.y0
+    own_args = None
     if problem.paths_differ:
-        high, low = _words(sample_numbers)
-        y0, own_args = _draw_starts(problem, key, high, low)
-    else:
-        y0 = problem.y0
-        own_args = None
+        y0, own_args = _draw_starts(problem, key, _words(sample_numbers))
     lanes, shared = kernels.lanes_and_shared(
         arrays,
         key,
@@ -207,28 +215,6 @@ def fused_start(
         own_args=own_args,
     )
     return kernels, lanes, shared
-
-
-def _compiled_problem(problem: Problem) -> Problem:
-    """The problem for which a kernel is compiled: with plain sweeps for root finders, and
-    with placeholders for step sizes, times and numbers of steps, which are inputs of the
-    kernel."""
-    zero = jnp.zeros(1, jnp.int32)
-    level = Level(
-        index=zero,
-        h=jnp.ones_like(problem.levels.h[:1]),
-        num_steps=zero,
-        saved_steps=zero[None],
-    )
-    return dataclasses.replace(
-        problem,
-        solver=by_sweeps_alone(problem.solver),
-        y0_of=None,
-        args_of=None,
-        levels=level,
-        weights=jnp.ones((1, 1)),
-        at_end=True,
-    )
 
 
 # A kernel keeps all that the user's functions capture, so only a few kernels are kept.

@@ -118,13 +118,11 @@ def level_weights(
     by_first_power = change / (2.0**order - 1)
     rows = [best, finest - best, best - best_without_coarsest, by_first_power]
     if levels > 2:
-        # The extrapolations from all but two neighbouring levels, of which there are three.
-        weights = _extrapolation_weights(order, levels - 2)
-        coarse = np.pad(weights, (0, 2))
-        middle = np.pad(weights, (1, 1))
-        fine = np.pad(weights, (2, 0))
-        last_change = fine - middle
-        change_before = middle - coarse
+        # Of the extrapolations from all but two neighbouring levels, of which there are
+        # three.
+        change = finer_change_weights(order, levels - 2)
+        last_change = np.append(0.0, change)
+        change_before = np.append(change, 0.0)
         # These extrapolations eliminate `levels - 3` powers of the step size. Halving the
         # step multiplies their error by 2^-power, with the first power that is left.
         power = order + levels - 3

@@ -15,7 +15,7 @@ from .._custom_types import Y
 from .._root_finder import all_finite
 from .._terms import path_keys, with_keys
 from .levels import Level
-from .problem import DrawnStart, Problem
+from .problem import Problem
 
 
 # The number of paths that take a step at once on CPUs. The arrays of more paths would not
@@ -46,18 +46,19 @@ class PathStates(eqx.Module):
     @staticmethod
     def start(
         problem: Problem,
-        starts: DrawnStart,
+        starts: tuple[Y, PyTree[Array]],
         solver_state: PyTree[Array],
         control: Any = None,
     ) -> "PathStates":
-        """Paths before their first step. A path whose initial state is not finite has
-        failed."""
+        """Paths before their first step, from `Problem.draw_start` for each. A path whose
+        initial state is not finite has failed."""
+        y0, args = starts
         # Without a barrier XLA checks a start that is constant, such as momenta at rest,
         # while compiling: for 30,000 paths of 36 momenta this takes 3 seconds.
-        y0 = lax.optimization_barrier(starts.y0)
+        y0 = lax.optimization_barrier(y0)
         failed = ~jax.vmap(all_finite)(y0)
         y = _replaced_where(failed, y0, problem.y0)
-        return PathStates(y, solver_state, failed, starts.args, control)
+        return PathStates(y, solver_state, failed, args, control)
 
     def after_step(
         self,
@@ -174,7 +175,7 @@ def simulate(
 def independent_motion(
     problem: Problem,
     level: Level,
-    starts: DrawnStart,
+    starts: tuple[Y, PyTree[Array]],
     terms_of: Callable[[Any], PyTree],
     randomness_of_step: Callable[[Any], PyTree[Array]],
 ) -> Motion:
@@ -198,9 +199,7 @@ def independent_motion(
 
     # `PathStates.start` replaces states that are not finite, but solver states are those of
     # the states before: such a path has failed, so its solver state does not matter.
-    solver_state = jax.vmap(solver_state_at_start)(
-        randomness_of_step(0), starts.y0, starts.args
-    )
+    solver_state = jax.vmap(solver_state_at_start)(randomness_of_step(0), *starts)
     return Motion(step, PathStates.start(problem, starts, solver_state))
 
 

@@ -7,7 +7,7 @@ Axes of arrays, here and in what simulates a problem: `n` paths, `d` entries of 
 import dataclasses
 import functools as ft
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -73,18 +73,6 @@ _START_KEY = 0x517A87
 # The `unit` of truncated increments that are made here, in units of the interval from `t0`
 # to `t1`: one step over all of it loses 0.04% of its variance, which is no warning.
 _UNIT_OF_TRUNCATION = 32
-
-
-class DrawnStart(NamedTuple):
-    """The start of a path (or of many, along the first axis of each array).
-
-    - `y0`: the initial state.
-    - `args`: the arrays in the `args` of the path, for `Problem.with_args`; `None` if all
-        paths have the same `args`.
-    """
-
-    y0: Y
-    args: PyTree[Array]
 
 
 class Problem(eqx.Module):
@@ -178,7 +166,9 @@ class Problem(eqx.Module):
         # With arrays in place of Python numbers, other numbers compile nothing anew. But a
         # function of the user may need the numbers themselves, for example in an `if`.
         try:
-            programs = programs_for(jtu.tree_map(_number_as_array, args))
+            # Integers are kept: they may be exponents or sizes.
+            as_array = lambda x: jnp.asarray(x) if type(x) is float else x
+            programs = programs_for(jtu.tree_map(as_array, args))
         except (ValueError, *NEED_VALUES):
             programs = None
         # Not within `except`: an error would be printed together with the one before.
@@ -279,19 +269,20 @@ class Problem(eqx.Module):
         """Whether not all paths have the same `y0` and `args`."""
         return self.y0_of is not None or self.args_of is not None
 
-    def draw_start(self, key: PRNGKeyArray) -> DrawnStart:
-        """The start of the sample with this key."""
+    def draw_start(self, key: PRNGKeyArray) -> tuple[Y, PyTree[Array]]:
+        """The initial state of the sample with this key, and the arrays in its `args`;
+        `None` if all paths have the same `args`."""
         y0_key, args_key = jr.split(jr.fold_in(key, _START_KEY))
         own_args = None
         if self.args_of is not None:
             own_args = eqx.filter(self.args_of(args_key), eqx.is_array)
-        if self.y0_of is None:
-            return DrawnStart(self.y0, own_args)
-        args = self.with_args(own_args).args
-        return DrawnStart(self.y0_of(y0_key, args), own_args)
+        y0 = self.y0
+        if self.y0_of is not None:
+            y0 = self.y0_of(y0_key, self.with_args(own_args).args)
+        return y0, own_args
 
     def with_args(self, own_args: PyTree[Array]) -> "Problem":
-        """The problem of a path with these arrays in its `args`, as in `DrawnStart`."""
+        """The problem of a path with these arrays in its `args`, as from `draw_start`."""
         if self.args_of is None and own_args is None:
             return self
         shared_args = eqx.filter(self.args, eqx.is_array, inverse=True)
@@ -356,12 +347,6 @@ class Problem(eqx.Module):
     ) -> tuple[PyTree[jax.ShapeDtypeStruct], jax.ShapeDtypeStruct]:
         return _structs_of_values(self.phi, self.t0, self.y0, self.args)
 
-    def unravel(self, x: Float[Array, "*axes m"]) -> PyTree[Array]:
-        """Vectors of all numbers of `phi`, as from `values`, in the structure of `phi`,
-        with the other axes of `x` in front."""
-        struct, _ = self._structs_of_values
-        return Layout.of(struct).unravel(x)
-
     @property
     def dtype_of_values(self) -> Any:
         """The dtype of `values`."""
@@ -405,11 +390,6 @@ def _order_of(solver: diffrax.AbstractSolver, terms: PyTree) -> int | float:
     """The weak order of a solver. Solvers of other packages have no `weak_order`, and
     solvers of the user may not state theirs: it counts as 1."""
     return getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
-
-
-def _number_as_array(x: Any) -> Any:
-    """A number of Python as an array. Integers are kept: they may be exponents or sizes."""
-    return jnp.asarray(x) if type(x) is float else x
 
 
 def advice_on_failures(problem: Problem | None) -> str:

@@ -111,21 +111,12 @@ class AbstractBasis(eqx.Module):
     candidate_name: eqx.AbstractClassVar[str]
     d: eqx.AbstractVar[int]
     candidates: eqx.AbstractVar[tuple[int, ...]]
-
-    @property
-    @abc.abstractmethod
-    def size(self) -> int:
-        """The number of coefficients of a function."""
-
-    @property
-    @abc.abstractmethod
-    def num_pilots(self) -> int:
-        """The number of pilot paths that a fit needs."""
-
-    @property
-    @abc.abstractmethod
-    def num_sites(self) -> int:
-        """The number of states at which a fit evaluates its target."""
+    # The number of coefficients of a function.
+    size: eqx.AbstractVar[int]
+    # The number of pilot paths that a fit needs.
+    num_pilots: eqx.AbstractVar[int]
+    # The number of states at which a fit evaluates its target.
+    num_sites: eqx.AbstractVar[int]
 
     @abc.abstractmethod
     def frame(

@@ -155,6 +155,7 @@ class Noise(eqx.Module):
             return y1, next_solver_state, jnp.all(success), value - mean
 
         # By the formula of this class.
+        assert second_derivatives is not None
         y1, next_solver_state, success = self.step(i, y, solver_state, x)
         value_after = ft.partial(self._value_after, i, y, solver_state, u)
         first_derivatives = jax.jacrev(value_after)(jnp.zeros_like(x))
