@@ -216,7 +216,7 @@ def ensemble(
     whole = _concatenated(batches, num_paths, at_end=ts is None)
     num_failed = int(np.sum(whole.failed))
     if num_failed > 0:
-        advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
+        advice = advice_on_failures(problem)
         warnings.warn(
             f"{num_failed:,} of {num_paths:,} paths failed. Their states are NaN: select "
             f"the others with `~failed`. {advice}",

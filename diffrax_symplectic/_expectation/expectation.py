@@ -242,9 +242,7 @@ def expectation(
         # Warnings of the problem come with its first samples, and not again with later
         # parts.
         if start is None and first == 0:
-            messages: list[str | None] = [
-                *messages_on_steps(problem.with_any_steps(), dt0)
-            ]
+            messages: list[str | None] = [*messages_on_steps(problem, dt0)]
             # A trial takes longer than these looks, which name the cause.
             if levels == 2 and not messages:
                 message, caveat = trial_with_finer_level(
@@ -272,10 +270,9 @@ def _messages_on_result(
     lost_numbers = out_of_range(problem, most_fail)
     if lost_numbers is not None and most_fail:
         return [*cautions(estimate, tol, advice=lost_numbers)]
-    advice = advice_on_failures(problem.has_bounded_increments, problem.is_implicit)
-    any_steps = problem.with_any_steps()
-    if most_fail and may_be_too_long(any_steps):
-        shorter = dt0 / max(4, unresolved_angle(any_steps) or 0)
+    advice = advice_on_failures(problem)
+    if most_fail and may_be_too_long(problem):
+        shorter = dt0 / max(4, unresolved_angle(problem) or 0)
         advice = (
             f"Most likely, steps of `dt0={dt0:g}` are too long for "
             f"`{type(problem.solver).__name__}`: pass `dt0={shorter:.2g}` or less, or an "

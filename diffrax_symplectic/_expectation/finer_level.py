@@ -76,7 +76,7 @@ def trial_with_finer_level(
         return None, ""
     key = trial_key(key)
     is_fitted = isinstance(estimate.sampling, ValueFunctions)
-    angle = unresolved_angle(problem.with_any_steps())
+    angle = unresolved_angle(problem)
     if plan.with_halved_steps is not None and (is_fitted or angle is None):
         changes = _changes_by_same_sampling(estimate, plan, key, devices)
     else:

@@ -36,7 +36,7 @@ def fused_plan(
             "Pass `devices=jax.devices()[:1]`."
         )
     plan = sampling.plan(
-        jtu.Partial(_samples_of_fused_paths, problem.with_any_steps()),
+        jtu.Partial(_samples_of_fused_paths, problem),
         Outputs.of(problem),
         devices,
         problem.bytes_of_state,

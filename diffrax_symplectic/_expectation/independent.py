@@ -50,7 +50,7 @@ class IndependentPaths(AbstractSampling):
 
     def prepare(self, problem, key, devices):
         return self.plan(
-            jtu.Partial(_samples_of_independent_paths, problem.with_any_steps()),
+            jtu.Partial(_samples_of_independent_paths, problem),
             Outputs.of(problem),
             devices,
             problem.bytes_of_state,

@@ -69,7 +69,7 @@ def jumps_within_steps(problem: Problem) -> str | None:
     times = _times_of_jumps(problem, steps)
     # Only jumps that another draw of `args` has, too, are at the same time on all paths.
     if problem.args_of is not None and times.size:
-        other_args = problem.draw_start(jr.key(2)).args
+        _, other_args = problem.draw_start(jr.key(2))
         other_times = _times_of_jumps(problem.with_args(other_args), steps)
         # (jumps of one draw, jumps of the other)
         are_equal = np.abs(times[:, None] - other_times) < steps.far

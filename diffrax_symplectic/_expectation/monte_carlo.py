@@ -149,7 +149,7 @@ def monte_carlo(
             sampling=sampling,
             digests=dict(fn=digest(programs), order=digest(order)),
         )  # fmt: skip
-        advice = advice_on_failures(has_bounded_increments=False, is_implicit=False)
+        advice = advice_on_failures(None)
         for message in cautions(estimate, tol, advice):
             warnings.warn(message, stacklevel=2)
     return estimate

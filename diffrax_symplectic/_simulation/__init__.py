@@ -42,4 +42,4 @@ from .loop import (
     Simulated,
     values_of_paths,
 )
-from .problem import advice_on_failures, DrawnStart, Problem, ravel, real_vector
+from .problem import advice_on_failures, Problem, ravel, real_vector

@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -55,17 +55,6 @@ _CELL_ROUNDING = 1e-3
 _MOST_LOST_VARIANCE = 1e-3
 
 
-class StepNumbers(NamedTuple):
-    """Numbers of steps with step size `dt0`.
-
-    - `saved`: for each saved time, the number of steps before it.
-    - `total`: the number of all steps.
-    """
-
-    saved: Int[np.ndarray, "..."]
-    total: np.integer
-
-
 def checked_key(caller: str, key: Any, others: Any) -> PRNGKeyArray:
     """The key that `caller` was called with, as a typed key. Raises a `ValueError` unless
     it is one random key, and for traced arrays in it or in the other arguments."""
@@ -86,10 +75,10 @@ def checked_key(caller: str, key: Any, others: Any) -> PRNGKeyArray:
 
 def step_numbers(
     t0: Any, t1: Any, dt0: Any, ts: Sequence[Any] | np.ndarray | Array | None
-) -> StepNumbers:
-    """The numbers of steps from `t0` to each of `ts` (to `t1` if `ts` is `None`) and to
-    `t1`. Raises a `ValueError` unless all times are numbers, a whole number of steps
-    apart."""
+) -> Int[np.ndarray, " times_and_1"]:
+    """The numbers of steps from `t0` to each of `ts` (to `t1` if `ts` is `None`) and last
+    of all to `t1`. Raises a `ValueError` unless all times are numbers, a whole number of
+    steps apart."""
     if dt0 is None:
         raise ValueError("`dt0` must be a number: steps are fixed; got None.")
     arguments = f"dt0={dt0!r}, t0={t0!r}, t1={t1!r}"
@@ -119,8 +108,7 @@ def step_numbers(
             "`ts` must hold at least one time, all between `t0` and `t1`; got "
             f"{brief(times)}."
         )
-    *saved, total = counts.astype(np.int32)
-    return StepNumbers(saved=np.array(saved), total=total)
+    return counts.astype(np.int32)
 
 
 def given_state(y0: Y) -> Y:
@@ -154,20 +142,13 @@ def drawn_args(args_of: Callable, key: PRNGKeyArray) -> Args:
         raise
 
     check_args(args)
+
     # Each path has its own arrays of JAX. All paths share leaves that are no arrays.
-    return jtu.tree_map(_with_jax_arrays, args)
+    def with_jax_array(leaf: Any) -> Any:
+        is_numpy = isinstance(leaf, np.ndarray | np.generic)
+        return jnp.asarray(leaf) if is_numpy else leaf
 
-
-def _with_jax_arrays(leaf: Any) -> Any:
-    """The leaf, as an array of JAX if it is one of NumPy."""
-    is_numpy = isinstance(leaf, np.ndarray | np.generic)
-    return jnp.asarray(leaf) if is_numpy else leaf
-
-
-def check_finite(y0: Y) -> None:
-    """Raises a `ValueError` unless the initial state is finite."""
-    if not all(np.all(np.isfinite(leaf)) for leaf in jtu.tree_leaves(y0)):
-        raise ValueError(f"`y0` must hold finite numbers; got {brief(y0)}.")
+    return jtu.tree_map(with_jax_array, args)
 
 
 def check_noise(terms: PyTree) -> None:
@@ -248,10 +229,8 @@ def is_multiple(time: float, cell: float) -> bool:
     return abs(quotient - round(quotient)) <= _CELL_ROUNDING
 
 
-@once_for_each_signature
-def check_fit(terms: PyTree, t0: Float[np.ndarray, ""], y0: Y, args: Args) -> None:
-    """Raises an error unless the terms fit the state."""
-    check_terms_fit_state(terms, t0, y0, args)
+# Raises an error unless the terms fit the state.
+check_fit = once_for_each_signature(check_terms_fit_state)
 
 
 def state_itself(t, y, args):

@@ -7,14 +7,14 @@ import threading
 import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Key, PRNGKeyArray, PyTree, UInt32
 
 from .._arguments import check_untraced
 from .._fused import (
@@ -22,12 +22,12 @@ from .._fused import (
     functions_and_arrays,
     Kernels,
     Lanes,
-    PathFunctions,
     sample_key,
 )
 from .._lapack import lapack_in_turn
 from .._programs import compiled
 from .._stablehlo import NotReplayed, source_lines
+from .layout import Layout
 from .levels import Level
 from .loop import values_of_paths
 from .problem import Problem
@@ -57,10 +57,6 @@ def warn_of_stragglers(
         )
 
 
-# The high or the low 32 bits of each of several sample numbers, which have 64 bits.
-_Words: TypeAlias = Array | np.ndarray
-
-
 class Batch(NamedTuple):
     """Paths along the first axis of each array, saved times along the second.
 
@@ -79,46 +75,47 @@ def by_jax(
 ) -> Batch:
     """The paths with these sample numbers on one level, simulated by JAX. The loop is that
     of `expectation`, which runs all levels of the problem: the others are dropped."""
-    high, low = _words(sample_numbers)
-    states_and_failed = _paths_by_jax(problem.with_any_steps(), key, high, low)
+    states_and_failed = _paths_by_jax(problem, key, _words(sample_numbers))
     # The results are traced if a function of the user closes over traced values.
     check_untraced("`ensemble`", states_and_failed)
     y, failed = jax.device_get(states_and_failed)
     return Batch(jtu.tree_map(lambda x: x[level], y), failed[level])
 
 
-def _words(sample_numbers: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _words(sample_numbers: np.ndarray) -> UInt32[np.ndarray, "2 n"]:
     """The high and the low 32 bits of 64-bit numbers."""
     high = sample_numbers >> np.uint64(32)
     low = sample_numbers & np.uint64(0xFFFFFFFF)
-    return high.astype(np.uint32), low.astype(np.uint32)
+    return np.stack([high, low]).astype(np.uint32)
 
 
-def _sample_keys(key: PRNGKeyArray, high: _Words, low: _Words) -> Array:
+def _sample_keys(
+    key: PRNGKeyArray, words: UInt32[Array | np.ndarray, "2 n"]
+) -> Key[Array, " n"]:
     """The random keys of the samples with these numbers."""
-    return jax.vmap(ft.partial(sample_key, key))(high, low)
+    return jax.vmap(ft.partial(sample_key, key))(*words)
 
 
 @compiled
 def _draw_starts(
-    problem: Problem, key: PRNGKeyArray, high: _Words, low: _Words
+    problem: Problem, key: PRNGKeyArray, words: UInt32[Array | np.ndarray, "2 n"]
 ) -> tuple[PyTree, PyTree]:
     """`Problem.draw_start` for the paths of a batch."""
-    return jax.vmap(problem.draw_start)(_sample_keys(key, high, low))
+    return jax.vmap(problem.draw_start)(_sample_keys(key, words))
 
 
 @compiled
 @lapack_in_turn
 def _paths_by_jax(
-    problem: Problem, key: PRNGKeyArray, high: _Words, low: _Words
+    problem: Problem, key: PRNGKeyArray, words: UInt32[Array | np.ndarray, "2 n"]
 ) -> tuple[PyTree[Array], Bool[Array, "levels n"]]:
     """The saved states of the paths of a batch, along axes of levels, paths and times, and
     which paths failed."""
     # (levels, times, paths, entries of the state)
-    states, failed = values_of_paths(problem, _sample_keys(key, high, low))
+    states, failed = values_of_paths(problem, _sample_keys(key, words))
     # (levels, paths, times, entries of the state)
     states = jnp.swapaxes(states, 1, 2)
-    return problem.unravel(states), failed
+    return Layout.of(problem.y0).unravel(states), failed
 
 
 def by_drjit(
@@ -155,63 +152,58 @@ def _fused_batch(
     failed."""
     kernels, lanes, shared = fused_start(problem, key, sample_numbers, level)
     saved_steps = np.asarray(problem.level(level).saved_steps)
-    # By the number of steps before a saved time: an array (paths,) for each entry of the
-    # state. The kernel is called once for all steps from one saved time to the next.
-    entries_after: dict[int, list[np.ndarray]] = {}
+    # By the number of steps before a saved time: (paths, entries of the state). The kernel
+    # is called once for all steps from one saved time to the next.
+    states_after: dict[int, np.ndarray] = {}
     num_steps_done = 0
     for num_steps in np.unique(saved_steps).tolist():
         # There is no step to take if the saved time is `t0`.
         if num_steps > num_steps_done:
             lanes = kernels.advance(lanes, shared, num_steps_done, num_steps)
         num_steps_done = num_steps
-        entries_after[num_steps] = [np.asarray(entry) for entry in lanes.y]
-    # An array (paths, times) for each entry. `ts` may repeat a time.
-    entries = [
-        np.stack([entries_after[step][k] for step in saved_steps.tolist()], axis=1)
-        for k in range(len(lanes.y))
-    ]
+        states_after[num_steps] = np.stack([*map(np.asarray, lanes.y)], axis=-1)
+    # (paths, times, entries of the state). `ts` may repeat a time.
+    states = np.stack([states_after[step] for step in saved_steps.tolist()], axis=1)
     # A copy, so that no array of Dr.Jit outlives this call, during which no other thread
     # uses Dr.Jit.
     is_unfinished = np.array(lanes.stopped)
     return Batch(
-        y=_states_of_entries(problem.y0, entries),
+        y=Layout.of(problem.y0).unravel(states),
         failed=is_unfinished,
         num_stragglers=int(np.sum(is_unfinished)),
     )
 
 
-class FusedStart(NamedTuple):
-    """The paths of a batch before their first step.
-
-    - `kernels`: what takes their steps, by
-        `kernels.advance(lanes, shared, first_step, end_step)`.
-    - `lanes`: what differs between paths.
-    - `shared`: what all paths share.
-    """
-
-    kernels: Kernels
-    lanes: Lanes
-    shared: dict[str, Any]
-
-
 def fused_start(
     problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
-) -> FusedStart:
-    """The paths with these sample numbers before their first step, and the kernels of the
-    problem, which are compiled unless they are known."""
+) -> tuple[Kernels, Lanes, dict[str, Any]]:
+    """The kernels of the problem, which are compiled unless they are known; what differs
+    between the paths with these sample numbers before their first step, and what they
+    share. `kernels.advance(lanes, shared, first_step, end_step)` takes their steps."""
+    # Kernels have plain sweeps for root finders. Step sizes, times and numbers of steps are
+    # inputs of a kernel, which is compiled for placeholders.
+    zero = jnp.zeros(1, jnp.int32)
+    any_h = jnp.ones_like(problem.levels.h[:1])
+    compiled_problem = dataclasses.replace(
+        problem,
+        solver=by_sweeps_alone(problem.solver),
+        y0_of=None,
+        args_of=None,
+        levels=Level(index=zero, h=any_h, num_steps=zero, saved_steps=zero[None]),
+        weights=jnp.ones((1, 1)),
+        at_end=True,
+    )
     example_args = None
     if problem.args_of is not None:
         example_args = eqx.filter(problem.args, eqx.is_array)
     functions, arrays = functions_and_arrays(
-        _compiled_problem(problem), key, example_args, problem.paths_differ
+        compiled_problem, key, example_args, problem.paths_differ
     )
     kernels = _kernels(functions)
+    y0 = problem.y0
+    own_args = None
     if problem.paths_differ:
-        high, low = _words(sample_numbers)
-        y0, own_args = _draw_starts(problem, key, high, low)
-    else:
-        y0 = problem.y0
-        own_args = None
+        y0, own_args = _draw_starts(problem, key, _words(sample_numbers))
     lanes, shared = kernels.lanes_and_shared(
         arrays,
         key,
@@ -221,36 +213,11 @@ def fused_start(
         y0=y0,
         own_args=own_args,
     )
-    return FusedStart(kernels, lanes, shared)
-
-
-def _compiled_problem(problem: Problem) -> Problem:
-    """The problem for which a kernel is compiled: with plain sweeps for root finders, and
-    with placeholders for step sizes, times and numbers of steps, which are inputs of the
-    kernel."""
-    zero = jnp.zeros(1, jnp.int32)
-    level = Level(
-        index=zero,
-        h=jnp.ones_like(problem.levels.h[:1]),
-        num_steps=zero,
-        saved_steps=zero[None],
-    )
-    return dataclasses.replace(
-        problem,
-        solver=by_sweeps_alone(problem.solver),
-        y0_of=None,
-        args_of=None,
-        levels=level,
-        weights=jnp.ones((1, 1)),
-        at_end=True,
-        most_steps=1,
-    )
+    return kernels, lanes, shared
 
 
 # A kernel keeps all that the user's functions capture, so only a few kernels are kept.
-@ft.lru_cache(maxsize=8)
-def _kernels(functions: PathFunctions) -> Kernels:
-    return Kernels(functions)
+_kernels = ft.lru_cache(maxsize=8)(Kernels)
 
 
 def _with_stragglers(
@@ -282,24 +249,6 @@ def _with_stragglers(
     failed = with_solved(fused.failed, solved.failed)
     y = jtu.tree_map(with_solved, fused.y, solved.y)
     return Batch(y, failed, num_stragglers)
-
-
-def _states_of_entries(y0: PyTree, entries: list[np.ndarray]) -> PyTree[np.ndarray]:
-    """States in the structure of `y0`, with leading axes for paths and times, from an array
-    (paths, times) for each of their entries."""
-    leaves, treedef = jtu.tree_flatten(y0)
-    remaining_entries = iter(entries)
-    paths_and_times = entries[0].shape
-    state_leaves = []
-    for leaf in leaves:
-        leaf_entries = [next(remaining_entries) for _ in range(leaf.size)]
-        if leaf_entries:
-            stacked = np.stack(leaf_entries, axis=-1)
-        else:
-            # An empty array has no entries to stack.
-            stacked = np.zeros((*paths_and_times, 0), leaf.dtype)
-        state_leaves.append(stacked.reshape(*paths_and_times, *leaf.shape))
-    return treedef.unflatten(state_leaves)
 
 
 def _refusal(error: BaseException | None) -> ValueError | None:

@@ -1,15 +1,16 @@
 """Levels, each with half the step of the one before, and the extrapolation from them to
 step size zero."""
 
+import dataclasses
 import enum
 from typing import Any
 
 import equinox as eqx
+import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._products import tensordot
-from .arguments import StepNumbers
 
 
 # Numbers of steps are 32-bit integers, which are less than this.
@@ -34,11 +35,13 @@ class Level(eqx.Module):
     saved_steps: Int[Array | np.ndarray, "*levels saves"]
 
 
-def levels_of(dt0: float, steps_of_dt0: StepNumbers, levels: int, dtype: Any) -> Level:
+def levels_of(
+    dt0: float, step_numbers: Int[np.ndarray, " saves_and_1"], levels: int, dtype: Any
+) -> Level:
     """All levels, along a leading axis: each has half the step of the one before.
-    `steps_of_dt0` are the numbers of steps on the first level. Raises a `ValueError` for
-    too many steps."""
-    if steps_of_dt0.total * 2.0 ** (levels - 1) >= _STEPS_TOO_MANY:
+    `step_numbers` are those on the first level, to each saved time and last of all to the
+    end. Raises a `ValueError` for too many steps."""
+    if step_numbers[-1] * 2.0 ** (levels - 1) >= _STEPS_TOO_MANY:
         raise ValueError(
             f"`levels={levels}` halves `dt0` {levels - 1} times, which is more than "
             "2^31 steps. Pass fewer levels: two to four are enough to extrapolate."
@@ -48,16 +51,16 @@ def levels_of(dt0: float, steps_of_dt0: StepNumbers, levels: int, dtype: Any) ->
     return Level(
         index=index,
         h=np.asarray(dt0 / steps_in_dt0, dtype),
-        num_steps=steps_in_dt0 * steps_of_dt0.total,
+        num_steps=steps_in_dt0 * step_numbers[-1],
         # (levels, saves)
-        saved_steps=steps_in_dt0[:, None] * steps_of_dt0.saved,
+        saved_steps=steps_in_dt0[:, None] * step_numbers[:-1],
     )
 
 
 def halved(levels: Level) -> Level:
     """These levels with halved steps."""
-    return Level(
-        index=levels.index,
+    return dataclasses.replace(
+        levels,
         h=levels.h / 2,
         num_steps=2 * levels.num_steps,
         saved_steps=2 * levels.saved_steps,
@@ -66,13 +69,9 @@ def halved(levels: Level) -> Level:
 
 def with_next_level(levels: Level) -> Level:
     """The levels, and one more."""
-    saved_steps = np.asarray(levels.saved_steps)
-    return Level(
-        index=np.append(levels.index, levels.index[-1] + 1),
-        h=np.append(levels.h, levels.h[-1] / 2),
-        num_steps=np.append(levels.num_steps, 2 * levels.num_steps[-1]),
-        saved_steps=np.concatenate([saved_steps, 2 * saved_steps[-1:]]),
-    )
+    next_levels = dataclasses.replace(halved(levels), index=levels.index + 1)
+    append = lambda x, next_x: np.append(x, next_x[-1:], axis=0)
+    return jtu.tree_map(append, levels, next_levels)
 
 
 class Combination(enum.IntEnum):
@@ -119,13 +118,11 @@ def level_weights(
     by_first_power = change / (2.0**order - 1)
     rows = [best, finest - best, best - best_without_coarsest, by_first_power]
     if levels > 2:
-        # The extrapolations from all but two neighbouring levels, of which there are three.
-        weights = _extrapolation_weights(order, levels - 2)
-        coarse = np.pad(weights, (0, 2))
-        middle = np.pad(weights, (1, 1))
-        fine = np.pad(weights, (2, 0))
-        last_change = fine - middle
-        change_before = middle - coarse
+        # Of the extrapolations from all but two neighbouring levels, of which there are
+        # three.
+        change = finer_change_weights(order, levels - 2)
+        last_change = np.append(0.0, change)
+        change_before = np.append(change, 0.0)
         # These extrapolations eliminate `levels - 3` powers of the step size. Halving the
         # step multiplies their error by 2^-power, with the first power that is left.
         power = order + levels - 3

@@ -1,6 +1,6 @@
 """The loop over fixed steps that all samplings share."""
 
-import functools as ft
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from .._custom_types import Y
 from .._root_finder import all_finite
 from .._terms import path_keys, with_keys
 from .levels import Level
-from .problem import DrawnStart, Problem
+from .problem import Problem
 
 
 # The number of paths that take a step at once on CPUs. The arrays of more paths would not
@@ -46,18 +46,19 @@ class PathStates(eqx.Module):
     @staticmethod
     def start(
         problem: Problem,
-        starts: DrawnStart,
+        starts: tuple[Y, PyTree[Array]],
         solver_state: PyTree[Array],
         control: Any = None,
     ) -> "PathStates":
-        """Paths before their first step. A path whose initial state is not finite has
-        failed."""
+        """Paths before their first step, from `Problem.draw_start` for each. A path whose
+        initial state is not finite has failed."""
+        y0, args = starts
         # Without a barrier XLA checks a start that is constant, such as momenta at rest,
         # while compiling: for 30,000 paths of 36 momenta this takes 3 seconds.
-        y0 = lax.optimization_barrier(starts.y0)
+        y0 = lax.optimization_barrier(y0)
         failed = ~jax.vmap(all_finite)(y0)
         y = _replaced_where(failed, y0, problem.y0)
-        return PathStates(y, solver_state, failed, starts.args, control)
+        return PathStates(y, solver_state, failed, args, control)
 
     def after_step(
         self,
@@ -123,7 +124,47 @@ def simulate(
 ) -> Simulated:
     """Simulates the paths of all levels, which move as `motion_on(level)` says. After each
     saved step `measure(phi, failed)` is saved, with `phi` of shape `(n, m)`."""
-    simulate_level = ft.partial(_simulate_level, problem, motion_on, measure)
+
+    def measure_if_saved(
+        level: Level, num_steps: Any, paths: PathStates, saved: Float[Array, "S ..."]
+    ) -> tuple[PathStates, Float[Array, "S ..."]]:
+        """The paths after so many steps, and the saved values, with a measurement among
+        them if these steps end at a saved time. A path whose `phi` is not finite has
+        failed."""
+
+        def with_measurement():
+            t = problem.t0 + num_steps * level.h
+            phi_of = lambda y, args: problem.with_args(args).values(t, y)
+            phi = jax.vmap(phi_of)(paths.y, paths.args)
+            failed = paths.failed | ~jax.vmap(all_finite)(phi)
+            # `ts` may repeat a time, so several rows of `saved` may belong to this time.
+            is_row_of_time = mask_like(level.saved_steps == num_steps, saved)
+            return failed, jnp.where(is_row_of_time, measure(phi, failed), saved)
+
+        # One predicate for all paths, so that `phi` is evaluated only after saved steps.
+        is_saved = jnp.any(level.saved_steps == num_steps)
+        failed, saved = lax.cond(
+            is_saved, with_measurement, lambda: (paths.failed, saved)
+        )
+        return dataclasses.replace(paths, failed=failed), saved
+
+    def simulate_level(level: Level) -> Simulated:
+        motion = motion_on(level)
+
+        def step_and_measure(i, carry):
+            paths, saved = carry
+            return measure_if_saved(level, i + 1, motion.step(i, paths), saved)
+
+        num_saves, m = problem.output_shape
+        dtype = problem.dtype_of_values
+        phi = jax.ShapeDtypeStruct((len(motion.start.failed), m), dtype)
+        measured = jax.eval_shape(measure, phi, motion.start.failed)
+        nothing_saved = jnp.zeros((num_saves, *measured.shape), dtype)
+        # A saved time may be `t0`.
+        carry = measure_if_saved(level, 0, motion.start, nothing_saved)
+        paths, saved = lax.fori_loop(0, level.num_steps, step_and_measure, carry)
+        return Simulated(saved, paths.failed, paths.control)
+
     if len(problem.levels.h) == 1:
         only_level = simulate_level(problem.level(0))
         return jtu.tree_map(lambda x: x[None], only_level)
@@ -131,69 +172,10 @@ def simulate(
     return lax.map(simulate_level, problem.levels)
 
 
-def _simulate_level(
-    problem: Problem,
-    motion_on: Callable[[Level], Motion],
-    measure: Callable,
-    level: Level,
-) -> Simulated:
-    """Simulates the paths of one level."""
-    motion = motion_on(level)
-
-    def step_and_measure(i, carry):
-        paths, saved = carry
-        num_steps = i + 1
-        paths_after_step = motion.step(i, paths)
-        return _measure_if_saved(
-            problem, level, measure, num_steps, paths_after_step, saved
-        )
-
-    num_saves, m = problem.output_shape
-    num_paths = len(motion.start.failed)
-    dtype = problem.dtype_of_values
-    phi = jax.ShapeDtypeStruct((num_paths, m), dtype)
-    measured = jax.eval_shape(measure, phi, motion.start.failed)
-    nothing_saved = jnp.zeros((num_saves, *measured.shape), dtype)
-    # A saved time may be `t0`.
-    carry = _measure_if_saved(problem, level, measure, 0, motion.start, nothing_saved)
-    paths, saved = lax.fori_loop(0, level.num_steps, step_and_measure, carry)
-    return Simulated(saved, paths.failed, paths.control)
-
-
-def _measure_if_saved(
-    problem: Problem,
-    level: Level,
-    measure: Callable,
-    num_steps: Any,
-    paths: PathStates,
-    saved: Float[Array, "S ..."],
-) -> tuple[PathStates, Float[Array, "S ..."]]:
-    """The paths after so many steps, and the saved values, with a measurement among them if
-    these steps end at a saved time. A path whose `phi` is not finite has failed."""
-
-    def with_measurement():
-        def phi_of(y, args):
-            return problem.with_args(args).values(problem.t0 + num_steps * level.h, y)
-
-        phi = jax.vmap(phi_of)(paths.y, paths.args)
-        failed = paths.failed | ~jax.vmap(all_finite)(phi)
-        # `ts` may repeat a time, so several rows of `saved` may belong to this time.
-        is_row_of_time = mask_like(level.saved_steps == num_steps, saved)
-        return failed, jnp.where(is_row_of_time, measure(phi, failed), saved)
-
-    def unchanged():
-        return paths.failed, saved
-
-    # One predicate for all paths, so that `phi` is evaluated only after saved steps.
-    is_saved = jnp.any(level.saved_steps == num_steps)
-    failed, saved = lax.cond(is_saved, with_measurement, unchanged)
-    return eqx.tree_at(lambda states: states.failed, paths, failed), saved
-
-
 def independent_motion(
     problem: Problem,
     level: Level,
-    starts: DrawnStart,
+    starts: tuple[Y, PyTree[Array]],
     terms_of: Callable[[Any], PyTree],
     randomness_of_step: Callable[[Any], PyTree[Array]],
 ) -> Motion:
@@ -217,9 +199,7 @@ def independent_motion(
 
     # `PathStates.start` replaces states that are not finite, but solver states are those of
     # the states before: such a path has failed, so its solver state does not matter.
-    solver_state = jax.vmap(solver_state_at_start)(
-        randomness_of_step(0), starts.y0, starts.args
-    )
+    solver_state = jax.vmap(solver_state_at_start)(randomness_of_step(0), *starts)
     return Motion(step, PathStates.start(problem, starts, solver_state))
 
 

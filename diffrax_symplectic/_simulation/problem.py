@@ -7,7 +7,7 @@ Axes of arrays, here and in what simulates a problem: `n` paths, `d` entries of 
 import dataclasses
 import functools as ft
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, PRNGKeyArray, PyTree
 
 from .._arguments import (
+    brief,
     check_args,
     check_made_for_noise,
     check_solver,
@@ -29,7 +30,6 @@ from .._arguments import (
     whole_number,
 )
 from .._brownian import has_bounded_increments
-from .._compat import is_traced
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Y
 from .._programs import digest, once_for_each_signature, traced
 from .._root_finder import all_finite
@@ -53,7 +53,6 @@ from .._terms import (
 )
 from .arguments import (
     check_cells,
-    check_finite,
     check_fit,
     check_noise,
     check_truncation,
@@ -74,18 +73,6 @@ _START_KEY = 0x517A87
 # The `unit` of truncated increments that are made here, in units of the interval from `t0`
 # to `t1`: one step over all of it loses 0.04% of its variance, which is no warning.
 _UNIT_OF_TRUNCATION = 32
-
-
-class DrawnStart(NamedTuple):
-    """The start of a path (or of many, along the first axis of each array).
-
-    - `y0`: the initial state.
-    - `args`: the arrays in the `args` of the path, for `Problem.with_args`; `None` if all
-        paths have the same `args`.
-    """
-
-    y0: Y
-    args: PyTree[Array]
 
 
 class Problem(eqx.Module):
@@ -111,9 +98,6 @@ class Problem(eqx.Module):
     # Which paths of the terms are one Brownian motion. Programs, whose keys are traced,
     # cannot tell.
     motion_numbers: tuple[int, ...] = eqx.field(static=True)
-    # The most steps of a level for which arrays have room. (Shapes must be known when
-    # compiling.)
-    most_steps: int = eqx.field(static=True)
 
     @staticmethod
     def of(
@@ -142,7 +126,7 @@ class Problem(eqx.Module):
         is_made_by_solver = which_are_shapes(terms)
         # The paths get keys for an example. In each sample others take their place.
         terms = with_paths_for_shapes(terms, ft.partial(own_path, solver, want))
-        steps_of_dt0 = step_numbers(t0, t1, dt0, ts)
+        numbers_of_steps = step_numbers(t0, t1, dt0, ts)
 
         # Where `args` or `y0` is drawn, an example takes its place. All draws have the same
         # structure, so it may be drawn from any key.
@@ -156,30 +140,35 @@ class Problem(eqx.Module):
         y0_of = y0 if callable(y0) else None
         y0 = given_state(y0) if y0_of is None else drawn_state(y0_of, key, args)
         check_state(caller, y0)
-        if y0_of is None:
-            check_finite(y0)
+        is_finite = all(np.all(np.isfinite(leaf)) for leaf in jtu.tree_leaves(y0))
+        if y0_of is None and not is_finite:
+            raise ValueError(f"`y0` must hold finite numbers; got {brief(y0)}.")
 
         check_drifts_differ(terms)
         # Times have the dtype of the state.
         t0_of_dtype = np.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
 
-        def programs_for(args: Args) -> _Programs:
+        def programs_for(args: Args) -> tuple:
+            """The functions of the problem, each traced once with these `args`, so that
+            what it closes over is known; and `args`."""
             draw_y0 = None
             if y0_of is not None:
                 draw = ft.partial(drawn_state, y0_of)
                 draw_y0 = traced(draw, key, args, identity=y0_of)
-            return _Programs(
-                phi=traced_phi(phi, terms, t0_of_dtype, y0, args),
-                terms=with_programs(terms, t0_of_dtype, y0, args),
-                solver=with_programs(solver, t0_of_dtype, y0, args),
-                y0_of=draw_y0,
-                args=args,
+            return (
+                traced_phi(phi, terms, t0_of_dtype, y0, args),
+                with_programs(terms, t0_of_dtype, y0, args),
+                with_programs(solver, t0_of_dtype, y0, args),
+                draw_y0,
+                args,
             )
 
         # With arrays in place of Python numbers, other numbers compile nothing anew. But a
         # function of the user may need the numbers themselves, for example in an `if`.
         try:
-            programs = programs_for(jtu.tree_map(_number_as_array, args))
+            # Integers are kept: they may be exponents or sizes.
+            as_array = lambda x: jnp.asarray(x) if type(x) is float else x
+            programs = programs_for(jtu.tree_map(as_array, args))
         except (ValueError, *NEED_VALUES):
             programs = None
         # Not within `except`: an error would be printed together with the one before.
@@ -212,7 +201,7 @@ class Problem(eqx.Module):
         check_stratonovich(terms, solver, t0_of_dtype, y0, args, all_terms=True)
         check_cells(terms, float(t0), smallest_step)
 
-        all_levels = levels_of(float(dt0), steps_of_dt0, levels, t0_of_dtype.dtype)
+        all_levels = levels_of(float(dt0), numbers_of_steps, levels, t0_of_dtype.dtype)
         weights = level_weights(_order_of(solver, terms), levels)
         return Problem(
             phi=phi,
@@ -227,22 +216,14 @@ class Problem(eqx.Module):
             weights=np.asarray(weights, jnp.result_type(float)),
             at_end=ts is None,
             motion_numbers=motion_numbers(brownian_paths(terms)),
-            most_steps=_room_for_steps(int(all_levels.num_steps[-1]), levels),
         )
-
-    def with_any_steps(self) -> "Problem":
-        """The same problem for programs in which no array has an axis of steps: as
-        `most_steps` is static, they would compile anew for another room."""
-        return dataclasses.replace(self, most_steps=0)
 
     def with_halved_steps(self) -> "Problem":
         """The same problem with halved steps on all levels."""
         return dataclasses.replace(self, levels=halved(self.levels))
 
     def level(self, index: IntScalarLike) -> Level:
-        """The level with this number, which may be traced."""
-        if is_traced(index):
-            return jtu.tree_map(lambda x: jnp.asarray(x)[index], self.levels)
+        """The level with this number, which may be traced within a program."""
         return jtu.tree_map(lambda x: x[index], self.levels)
 
     @property
@@ -288,19 +269,20 @@ class Problem(eqx.Module):
         """Whether not all paths have the same `y0` and `args`."""
         return self.y0_of is not None or self.args_of is not None
 
-    def draw_start(self, key: PRNGKeyArray) -> DrawnStart:
-        """The start of the sample with this key."""
+    def draw_start(self, key: PRNGKeyArray) -> tuple[Y, PyTree[Array]]:
+        """The initial state of the sample with this key, and the arrays in its `args`;
+        `None` if all paths have the same `args`."""
         y0_key, args_key = jr.split(jr.fold_in(key, _START_KEY))
         own_args = None
         if self.args_of is not None:
             own_args = eqx.filter(self.args_of(args_key), eqx.is_array)
-        if self.y0_of is None:
-            return DrawnStart(self.y0, own_args)
-        args = self.with_args(own_args).args
-        return DrawnStart(self.y0_of(y0_key, args), own_args)
+        y0 = self.y0
+        if self.y0_of is not None:
+            y0 = self.y0_of(y0_key, self.with_args(own_args).args)
+        return y0, own_args
 
     def with_args(self, own_args: PyTree[Array]) -> "Problem":
-        """The problem of a path with these arrays in its `args`, as in `DrawnStart`."""
+        """The problem of a path with these arrays in its `args`, as from `draw_start`."""
         if self.args_of is None and own_args is None:
             return self
         shared_args = eqx.filter(self.args, eqx.is_array, inverse=True)
@@ -356,27 +338,14 @@ class Problem(eqx.Module):
         """How the vectors of samples make PyTrees like `phi`, with an axis of times unless
         the mean is at `t1` only."""
         num_times, _ = self.output_shape
-        return Layout.of(self._struct_of_phi, None if self.at_end else num_times)
+        struct, _ = self._structs_of_values
+        return Layout.of(struct, None if self.at_end else num_times)
 
     @property
-    def _struct_of_phi(self) -> PyTree[jax.ShapeDtypeStruct]:
-        struct, _ = _structs_of_values(self.phi, self.t0, self.y0, self.args)
-        return struct
-
-    @property
-    def _struct_of_values(self) -> jax.ShapeDtypeStruct:
-        _, struct = _structs_of_values(self.phi, self.t0, self.y0, self.args)
-        return struct
-
-    def unravel(self, x: Float[Array, "*axes m"]) -> PyTree[Array]:
-        """Vectors of all numbers of `phi`, as from `values`, in the structure of `phi`,
-        with the other axes of `x` in front."""
-        return Layout.of(self._struct_of_phi).unravel(x)
-
-    @property
-    def has_bounded_increments(self) -> bool:
-        """Whether the increments of all paths are known to be bounded."""
-        return all(has_bounded_increments(path) for path in brownian_paths(self.terms))
+    def _structs_of_values(
+        self,
+    ) -> tuple[PyTree[jax.ShapeDtypeStruct], jax.ShapeDtypeStruct]:
+        return _structs_of_values(self.phi, self.t0, self.y0, self.args)
 
     @property
     def is_implicit(self) -> bool:
@@ -389,7 +358,8 @@ class Problem(eqx.Module):
     @property
     def dtype_of_values(self) -> Any:
         """The dtype of `values`."""
-        return self._struct_of_values.dtype
+        _, struct = self._structs_of_values
+        return struct.dtype
 
     @property
     def dtype(self) -> Any:
@@ -404,7 +374,8 @@ class Problem(eqx.Module):
     @property
     def output_shape(self) -> tuple[int, int]:
         """The number `S` of times at which to average, and `m` of components of `phi`."""
-        return self.levels.saved_steps.shape[1], self._struct_of_values.size
+        _, struct = self._structs_of_values
+        return self.levels.saved_steps.shape[1], struct.size
 
 
 @once_for_each_signature
@@ -429,44 +400,21 @@ def _order_of(solver: diffrax.AbstractSolver, terms: PyTree) -> int | float:
     return getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
 
 
-def _room_for_steps(finest_steps: int, levels: int) -> int:
-    """The steps for which programs have room, for this many on the finest of the levels."""
-    # With two levels a trial halves all steps.
-    most = 2 * finest_steps if levels == 2 else finest_steps
-    # Powers of two, so that most other numbers of steps compile nothing anew.
-    return 1 << (most - 1).bit_length()
-
-
-class _Programs(NamedTuple):
-    """The functions of a problem, each traced once with these `args`, so that what it
-    closes over is known. The fields are those of `Problem`."""
-
-    phi: Any
-    terms: PyTree[diffrax.AbstractTerm]
-    solver: diffrax.AbstractSolver
-    y0_of: Any
-    args: Args
-
-
-def _number_as_array(x: Any) -> Any:
-    """A number of Python as an array. Integers are kept: they may be exponents or sizes."""
-    return jnp.asarray(x) if type(x) is float else x
-
-
-def advice_on_failures(has_bounded_increments: bool, is_implicit: bool) -> str:
-    """What to do about failed paths, in sentences for messages. The arguments are whether
-    the increments of all paths are known to be bounded, and whether the solver is known to
-    be implicit."""
+def advice_on_failures(problem: Problem | None) -> str:
+    """What to do about failed paths of a problem, or of a function of the user for `None`,
+    in sentences for messages."""
     no_solution = ""
-    if is_implicit:
-        no_solution = (
-            "The equations of an implicit step may have no solution, for example where "
-            "particles meet: pass a smaller `dt0`, or an explicit solver. If they are only "
-            "hard, pass `root_finder=PicardNewton(newton_steps=1000)` to the solver. "
-        )
-    alternative = ""
-    if not has_bounded_increments:
-        alternative = " or bounded increments, as from a `WeakBrownianPath`,"
+    alternative = " or bounded increments, as from a `WeakBrownianPath`,"
+    if problem is not None:
+        if problem.is_implicit:
+            no_solution = (
+                "The equations of an implicit step may have no solution, for example where "
+                "particles meet: pass a smaller `dt0`, or an explicit solver. If they are "
+                "only hard, pass `root_finder=PicardNewton(newton_steps=1000)` to the "
+                "solver. "
+            )
+        if all(map(has_bounded_increments, brownian_paths(problem.terms))):
+            alternative = ""
     return (
         f"{no_solution}"
         f"Take smaller steps{alternative} and look for NaNs in `y0`, `args` and the "

@@ -38,7 +38,9 @@ class StepVariables(NamedTuple):
     """
 
     laws: tuple[AbstractLaw, ...]
-    terms_with: Callable[[Float[Array, " n"]], PyTree[diffrax.AbstractTerm]]
+    terms_with: Callable[
+        [Float[Array | np.ndarray, " n"]], PyTree[diffrax.AbstractTerm]
+    ]
 
 
 def step_variables(

@@ -19,4 +19,4 @@ def problem_of(
     """As `expectation` makes it."""
     t1 = t0 + num_steps * h
     given = _total, terms, solver, t0, t1, h, y0, args, None, levels
-    return Problem.of(*given, key=jr.key(0)).with_any_steps()
+    return Problem.of(*given, key=jr.key(0))

@@ -15,7 +15,7 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation.choose import sampling_for
 from diffrax_symplectic._expectation.estimate.estimate import combined_results
-from diffrax_symplectic._expectation.fitted import basis_choice, value_functions
+from diffrax_symplectic._expectation.fitted import value_functions
 from diffrax_symplectic._expectation.fitted.basis_choice import chosen_basis
 from diffrax_symplectic._expectation.fitted.mixture import (
     log_ratios_of_outcomes,
@@ -419,7 +419,7 @@ def test_a_fit_that_would_take_long_is_coarser_or_told(monkeypatch):
     sites = [at(steps).basis.num_sites for steps in (100, 10_000, 100_000)]
     assert sites == sorted(sites, reverse=True) and len(set(sites)) == 3
     assert 100_000 * 3 * sites[-1] < 2**27
-    monkeypatch.setattr(basis_choice, "_MOST_WITHOUT_WARNING", 1000)
+    monkeypatch.setattr(value_functions, "_MOST_WITHOUT_WARNING", 1000)
     with pytest.warns(UserWarning, match="takes as long as .* independent paths"):
         _estimate(ds.ValueFunctions(2, 64))
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._expectation.fitted import basis_choice, value_functions
+from diffrax_symplectic._expectation.fitted import value_functions
 
 from ..drjit_here import needs_drjit
 from .steps import problem_of
@@ -113,7 +113,7 @@ def test_of_coordinates_to_sort_by():
 
 @pytest.mark.slow
 def test_of_a_fit_that_takes_long(monkeypatch):
-    monkeypatch.setattr(basis_choice, "_MOST_WITHOUT_WARNING", 1)
+    monkeypatch.setattr(value_functions, "_MOST_WITHOUT_WARNING", 1)
     sampling = ds.ValueFunctions(2, 64)
     here(mean(first, WEAK, jnp.ones(2), sampling), "The fit of `ValueFunctions`")
 
@@ -123,9 +123,8 @@ def test_of_a_fit_that_is_no_better(monkeypatch):
     comparison = value_functions._comparison
 
     def none_is_better(*given):
-        found = comparison(*given)
-        unused = np.zeros_like(found.choice.used)
-        return found._replace(choice=found.choice._replace(used=unused))
+        choice, remainder = comparison(*given)
+        return np.zeros_like(choice), remainder
 
     monkeypatch.setattr(value_functions, "_comparison", none_is_better)
     here(mean(first, sampling=ds.ValueFunctions(2, 64)), "is no better than")

@@ -4,7 +4,7 @@
 import abc
 import functools as ft
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
 import jax
@@ -111,21 +111,12 @@ class AbstractBasis(eqx.Module):
     candidate_name: eqx.AbstractClassVar[str]
     d: eqx.AbstractVar[int]
     candidates: eqx.AbstractVar[tuple[int, ...]]
-
-    @property
-    @abc.abstractmethod
-    def size(self) -> int:
-        """The number of coefficients of a function."""
-
-    @property
-    @abc.abstractmethod
-    def num_pilots(self) -> int:
-        """The number of pilot paths that a fit needs."""
-
-    @property
-    @abc.abstractmethod
-    def num_sites(self) -> int:
-        """The number of states at which a fit evaluates its target."""
+    # The number of coefficients of a function.
+    size: eqx.AbstractVar[int]
+    # The number of pilot paths that a fit needs.
+    num_pilots: eqx.AbstractVar[int]
+    # The number of states at which a fit evaluates its target.
+    num_sites: eqx.AbstractVar[int]
 
     @abc.abstractmethod
     def frame(
@@ -197,7 +188,8 @@ class Hermite(AbstractBasis):
         # (n, C, S * m)
         flat_values = values.reshape(*values.shape[:2], -1)
         # Rows of zeros have no part in a fit.
-        is_used = good & _is_finite_row(B) & _is_finite_row(flat_values)
+        is_finite = jnp.isfinite(flat_values).all(axis=(1, 2))
+        is_used = good & jnp.isfinite(B).all(axis=1) & is_finite
         B = jnp.where(is_used[:, None], B, 0)
         flat_values = jnp.where(is_used[:, None, None], flat_values, 0)
         sizes = [num_polynomials(self.d, degree) for degree in self.candidates]
@@ -208,32 +200,21 @@ class Hermite(AbstractBasis):
         self, frame: CovarianceFrame, points: Float[Array, "n d"]
     ) -> Float[Array, "n size"]:
         """The values of all polynomials at points."""
-        at_point = lambda z: jnp.stack(hermite(z, max(self.candidates)))
-        return jax.vmap(at_point)(frame.coordinates(points))
+        of_all_points = jax.vmap(ft.partial(hermite, degree=max(self.candidates)))
+        return jnp.stack(of_all_points(frame.coordinates(points)), axis=1)
 
     def value_at(self, frame, y, c):
         # As a sum of products this compiles to one loop without temporary arrays.
         polynomials = hermite(frame.coordinates(y), max(self.candidates))
-        terms = [value * coefficient for value, coefficient in zip(polynomials, c)]
-        return ft.reduce(jnp.add, terms)
-
-
-def _is_finite_row(x: Float[Array, "n ..."]) -> Bool[Array, " n"]:
-    return jnp.isfinite(x).reshape(len(x), -1).all(axis=1)
-
-
-class CentredFrame(NamedTuple):
-    """Coordinates of `Quadratic`: states minus their `mean`, divided by these `scales`,
-    which are zero for components that do not move."""
-
-    mean: Float[Array, " d"]
-    scales: Float[Array, " d"]
+        return ft.reduce(jnp.add, map(jnp.multiply, polynomials, c))
 
 
 class Quadratic(AbstractBasis):
     """Linear and quadratic functions, with a candidate for each degree. The coefficients
     are the first and then the second derivatives, averaged over the pilot's states. For
-    Gaussian states this is the least-squares fit, by Stein's lemma."""
+    Gaussian states this is the least-squares fit, by Stein's lemma. Coordinates are states
+    minus their mean, divided by their scales, which are zero for components that do not
+    move."""
 
     candidate_name: ClassVar[str] = "degree"
     d: int
@@ -245,10 +226,8 @@ class Quadratic(AbstractBasis):
 
     @property
     def num_pilots(self):
-        affordable = _QUADRATIC_GRADIENTS // self.d
-        return int(
-            np.clip(affordable, _FEWEST_QUADRATIC_PILOTS, _MOST_QUADRATIC_PILOTS)
-        )
+        affordable = max(_FEWEST_QUADRATIC_PILOTS, _QUADRATIC_GRADIENTS // self.d)
+        return min(affordable, _MOST_QUADRATIC_PILOTS)
 
     @property
     def num_sites(self):
@@ -256,15 +235,17 @@ class Quadratic(AbstractBasis):
         return 2 * self.d * self.num_pilots
 
     def frame(self, states, good, scales):
-        return CentredFrame(equal_weights(good, states.dtype) @ states, scales)
+        return equal_weights(good, states.dtype) @ states, scales
 
     def coefficients(self, target, frame, states, good, keys):
+        _, scales = frame
+
         def derivatives(key_and_state):
             """The first and second derivatives at a state, by its coordinates."""
             key, y = key_and_state
 
             def target_from_state(z):
-                return target(y + frame.scales * z, key)
+                return target(y + scales * z, key)
 
             def gradient_twice(z):
                 gradient = jax.jacrev(target_from_state)(z)
@@ -289,7 +270,8 @@ class Quadratic(AbstractBasis):
         return jnp.where(order <= degrees, mean, 0)
 
     def value_at(self, frame, y, c):
-        z = (y - frame.mean) * inverse_or_zero(frame.scales)
+        mean, scales = frame
+        z = (y - mean) * inverse_or_zero(scales)
         d = len(y)
         gradient = c[:d]
         hessian = c[d:].reshape(d, d, *c.shape[1:])

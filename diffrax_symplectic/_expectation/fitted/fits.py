@@ -1,7 +1,8 @@
 """Target functions, fitted backwards in time at the states of a pilot run."""
 
+import dataclasses
 import functools as ft
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,31 +15,16 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Key, PRNGKeyArray, PyTree
 
 from ..._custom_types import Y
+from ..._lapack import lapack_in_turn
+from ..._programs import compiled
 from ..._simulation import PathStates, Problem, ravel
 from .bases import AbstractBasis, equal_weights, Target
-from .noise import cuts_by, cuts_of, Noise
+from .noise import cuts_of, Noise
 
 
 # The number of states over which second derivatives along the noise are averaged. A rough
 # mean will do: with any number in place of it, the control variate has mean zero.
 _STATES_FOR_SECOND = 32
-
-
-class Choice(NamedTuple):
-    """What is used for each time at which to average and each component of `phi`.
-
-    - `best`: the number of the best candidate.
-    - `used`: whether its control variate is used, or none.
-    """
-
-    best: Int[Array | np.ndarray, "S m"]
-    used: Bool[Array | np.ndarray, "S m"]
-
-    @staticmethod
-    def of_all(candidate: int, output_shape: tuple[int, int]) -> "Choice":
-        """The same candidate for all."""
-        best = np.full(output_shape, candidate)
-        return Choice(best, np.ones(output_shape, bool))
 
 
 class FittedFunctions(eqx.Module):
@@ -64,74 +50,95 @@ class FittedFunctions(eqx.Module):
         frame = jtu.tree_map(lambda x: x[i], self.frames)
         return self.basis.value_at(frame, ravel(y), self.coefficients[i])
 
-    def of_candidates(self, best: Int[Array | np.ndarray, "S m"]) -> "FittedFunctions":
+    def of_candidates(self, best: Int[Array, "S m"]) -> "FittedFunctions":
         """The functions of these candidates, one for each time and component."""
 
         def take(x: Float[Array, "... C S m"]) -> Float[Array, "... S m"]:
             index = best.reshape(*[1] * (x.ndim - 2), *best.shape)
             return jnp.take_along_axis(x, index, -3).squeeze(-3)
 
-        return FittedFunctions(
-            frames=self.frames,
+        return dataclasses.replace(
+            self,
             coefficients=take(self.coefficients),
             # `None` has no leaves.
             second_derivatives=jtu.tree_map(take, self.second_derivatives),
-            basis=self.basis,
         )
 
 
+def room_for_steps(problem: Problem) -> int:
+    """The number of steps for which the arrays of a fit have room, on any level: their
+    shapes must be known when compiling."""
+    # With two levels a trial halves all steps.
+    most = problem.finest_steps * (2 if len(problem.levels.h) == 2 else 1)
+    # Powers of two, so that most other numbers of steps compile nothing anew.
+    return 1 << (most - 1).bit_length()
+
+
+@ft.partial(compiled, quickly=True)
+@lapack_in_turn
 def fit(
-    noise: Noise, key: PRNGKeyArray, basis: AbstractBasis
+    problem: Problem,
+    index: Int[Array, ""],
+    key: PRNGKeyArray,
+    basis: AbstractBasis,
+    most_steps: int,
 ) -> tuple[FittedFunctions, Int[Array, ""]]:
-    """The functions of a level, by a pilot run forward in time and fits backward; and how
-    many of the pilot's paths failed."""
-    problem = noise.problem
+    """The functions of the level with this index, with a leading axis of levels, by a pilot
+    run forward in time and fits backward; and how many of the pilot's paths failed. All
+    levels have arrays for `most_steps` steps, so that they share a program."""
+    noise = Noise.of(problem, problem.level(index))
     num_steps = noise.level.num_steps
-    pilot = _run_pilot(noise, jr.split(key, basis.num_pilots))
-    scales = _scales(problem, pilot, num_steps)
+    keys = jr.split(jr.fold_in(key, index), basis.num_pilots)
+    starts, states, good = _run_pilot(noise, keys, most_steps)
+    scales = _scales(problem, starts, states, good, num_steps)
 
     def frame_after(i: Any) -> PyTree[Array]:
-        return basis.frame(pilot.states[i], pilot.good, scales)
+        return basis.frame(states[i], good, scales)
 
     def fit_step(num_fitted: Any, fitted: FittedFunctions) -> FittedFunctions:
         # The functions after later steps come first: those after a step are fitted to them.
         i = num_steps - 1 - num_fitted
         frame = frame_after(i)
         target = _target(noise, fitted, i)
-        coefficients = basis.coefficients(
-            target, frame, pilot.states[i], pilot.good, pilot.keys
-        )
+        coefficients = basis.coefficients(target, frame, states[i], good, keys)
         put_step = lambda of_steps, of_step: of_steps.at[i].set(of_step)
-        return FittedFunctions(
+        return dataclasses.replace(
+            fitted,
             frames=jtu.tree_map(put_step, fitted.frames, frame),
             coefficients=put_step(fitted.coefficients, coefficients),
-            second_derivatives=None,
-            basis=basis,
         )
 
-    # All levels have arrays for the same number of steps, so that they share a program.
     def zeros_for_all_steps(of_step: jax.ShapeDtypeStruct) -> Array:
-        return jnp.zeros((problem.most_steps, *of_step.shape), of_step.dtype)
+        return jnp.zeros((most_steps, *of_step.shape), of_step.dtype)
 
     shape = (basis.size, len(basis.candidates), *problem.output_shape)
-    struct_of_frame = jax.eval_shape(lambda: frame_after(0))
-    struct_of_coefficients = jax.ShapeDtypeStruct(shape, problem.dtype)
     unfitted = FittedFunctions(
-        frames=jtu.tree_map(zeros_for_all_steps, struct_of_frame),
-        coefficients=zeros_for_all_steps(struct_of_coefficients),
+        frames=jtu.tree_map(zeros_for_all_steps, jax.eval_shape(frame_after, 0)),
+        coefficients=jnp.zeros((most_steps, *shape), problem.dtype),
         second_derivatives=None,
         basis=basis,
     )
     fitted = lax.fori_loop(0, num_steps, fit_step, unfitted)
+
     # No fit reads second derivatives, so they are computed once, at the end.
-    functions = FittedFunctions(
-        frames=fitted.frames,
-        coefficients=fitted.coefficients,
-        second_derivatives=_second_derivatives(noise, pilot, fitted),
-        basis=basis,
+    _, unravel = jfu.ravel_pytree(problem.y0)
+
+    def second_derivatives_of_step(
+        step_and_states: tuple[Array, Float[Array, "n d"]],
+    ) -> Array | None:
+        i, states_before = step_and_states
+        ys = jax.vmap(unravel)(states_before)
+        return noise.mean_second_derivatives(i, ys, ft.partial(fitted, i))
+
+    # The states before each step are those after the step before: (steps, paths, d).
+    states_before = jnp.concatenate([starts[None], states[:-1]])
+    steps_and_states = (
+        jnp.arange(most_steps),
+        states_before[:, :_STATES_FOR_SECOND],
     )
-    num_failed = jnp.sum(~pilot.good)
-    return functions, num_failed
+    second_derivatives = lax.map(second_derivatives_of_step, steps_and_states)
+    functions = dataclasses.replace(fitted, second_derivatives=second_derivatives)
+    return jtu.tree_map(lambda x: x[None], functions), jnp.sum(~good)
 
 
 def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
@@ -151,10 +158,11 @@ def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
         y = unravel(flat_y)
         variables = None
         if key is not None:
-            # Draws by one key are numbered. The pilot's own steps have the numbers below
-            # `most_steps`.
-            number = problem.most_steps + i
-            variables, _ = noise.draw(key, number, cuts_of(noise.laws))
+            # Draws by one key are numbered. The pilot's own steps have the numbers of the
+            # steps for which there is room.
+            number = len(fitted.coefficients) + i
+            cuts = cuts_of([law.probabilities for law in noise.laws])
+            variables, _ = noise.draw(key, number, cuts)
         # (C, S, m), and `phi` (m).
         mean = noise.mean(next_step, y, ft.partial(fitted, next_step), variables)
         phi = problem.values(problem.t0 + (i + 1) * level.h, y).astype(mean.dtype)
@@ -167,49 +175,18 @@ def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
     return value
 
 
-def _second_derivatives(
-    noise: Noise, pilot: "_Pilot", fitted: FittedFunctions
-) -> Float[Array, "steps n n C S m"] | None:
-    """Second derivatives of the functions after each step along its noise, averaged over
-    some of the pilot's states before the step; `None` if they are not needed."""
-    _, unravel = jfu.ravel_pytree(noise.problem.y0)
-
-    def mean_of_step(step_and_states):
-        i, states = step_and_states
-        value_after_step = lambda y1: fitted(i, y1)
-        return noise.mean_second_derivatives(
-            i, jax.vmap(unravel)(states), value_after_step
-        )
-
-    # The states before each step are those after the step before: (steps, paths, d).
-    states_before = jnp.concatenate([pilot.starts[None], pilot.states[:-1]])
-    few_states = states_before[:, :_STATES_FOR_SECOND]
-    steps = jnp.arange(noise.problem.most_steps)
-    return lax.map(mean_of_step, (steps, few_states))
-
-
-class _Pilot(NamedTuple):
-    """Paths at whose states functions are fitted.
-
-    - `keys`: their random keys.
-    - `starts`: their states at the start.
-    - `states`: their states after each step.
-    - `good`: which of them did not fail.
-    """
-
-    keys: Key[Array, " paths"]
-    starts: Float[Array, "paths d"]
-    states: Float[Array, "steps paths d"]
-    good: Bool[Array, " paths"]
-
-
-def _run_pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
-    """Simulates a path for each key."""
+def _run_pilot(
+    noise: Noise, keys: Key[Array, " paths"], most_steps: int
+) -> tuple[
+    Float[Array, "paths d"], Float[Array, "steps paths d"], Bool[Array, " paths"]
+]:
+    """Simulates a path for each key, at whose states functions are fitted. The states at
+    the start and after each step, and which of the paths did not fail."""
     problem = noise.problem
     # With equal probabilities of all outcomes the pilot's paths spread further than others,
     # so that the fit also holds for outliers.
-    equal_cuts = cuts_by(
-        [np.full_like(x.values, 1 / len(x.values)) for x in noise.laws]
+    equal_cuts = cuts_of(
+        [np.full(len(x.values), 1 / len(x.values)) for x in noise.laws]
     )
 
     def step_one(
@@ -217,6 +194,7 @@ def _run_pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
     ) -> tuple[Y, Bool[Array, ""]]:
         x, _ = noise.draw(key, i, equal_cuts)
         noise_of_path = noise.with_args(args)
+        # Solvers start anew in each step, which is good enough for a fit.
         solver_state = noise_of_path.new_solver_state(i, y)
         y, _, success = noise_of_path.step(i, y, solver_state, x)
         return y, success
@@ -228,28 +206,33 @@ def _run_pilot(noise: Noise, keys: Key[Array, " paths"]) -> _Pilot:
         paths = paths.after_step(problem, y, None, success)
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
-    # Solvers start anew in each step, which is good enough for a fit.
     paths = PathStates.start(
         problem, jax.vmap(problem.draw_start)(keys), solver_state=None
     )
     starts = jax.vmap(ravel)(paths.y)
-    states = jnp.broadcast_to(starts, (problem.most_steps, *starts.shape))
+    states = jnp.broadcast_to(starts, (most_steps, *starts.shape))
     carry = paths, states
     paths, states = lax.fori_loop(0, noise.level.num_steps, step_all, carry)
-    return _Pilot(keys, starts, states, ~paths.failed)
+    return starts, states, ~paths.failed
 
 
-def _scales(problem: Problem, pilot: _Pilot, num_steps: Any) -> Float[Array, " d"]:
+def _scales(
+    problem: Problem,
+    starts: Float[Array, "paths d"],
+    states: Float[Array, "steps paths d"],
+    good: Bool[Array, " paths"],
+    num_steps: Any,
+) -> Float[Array, " d"]:
     """How far each component moves: the root of the mean squared distance from the start
     over all steps of good paths. Zero for components that do not move."""
-    start, _ = jfu.ravel_pytree(problem.y0)
+    start = ravel(problem.y0)
     if problem.y0_of is not None:
-        start = jnp.mean(pilot.starts, axis=0)
+        start = jnp.mean(starts, axis=0)
     # (steps, paths, d)
-    distances = jnp.where(pilot.good[:, None], jnp.abs(pilot.states - start), 0)
+    distances = jnp.where(good[:, None], jnp.abs(states - start), 0)
     # Dividing by the largest value first avoids underflow of squares in single precision.
     largest = jnp.max(distances, axis=(0, 1))
     scaled = distances / jnp.where(largest > 0, largest, 1)
-    weights = equal_weights(pilot.good, start.dtype)
+    weights = equal_weights(good, start.dtype)
     mean_square = jnp.einsum("n,ind->d", weights, scaled**2) / num_steps
     return largest * jnp.sqrt(mean_square)

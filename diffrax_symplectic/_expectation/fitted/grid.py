@@ -1,7 +1,6 @@
 """Value functions of one or two coordinates on a grid."""
 
 import functools as ft
-import itertools
 import math
 from typing import ClassVar
 
@@ -10,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from ..._products import tensordot
 from .bases import AbstractBasis, CovarianceFrame, Hermite
@@ -173,11 +172,19 @@ class Grid(AbstractBasis):
         residual = values[num_pilots:] - tensordot(polynomials, c, 1)
         # The target may overflow where it grows fast.
         residual = jnp.where(jnp.isfinite(residual), residual, 0)
-        best_degree = _best_degree_near_edge(x, residual)
+        # The degree that leaves the least near the edge, for each time and component.
+        distance = np.max(np.abs(x), axis=1)
+        is_near_edge = (distance > _START_NEAR_EDGE) & (distance < _START_OF_FALL)
+        largest_residual = jnp.max(jnp.abs(residual[is_near_edge]), axis=0)
+        best_degree = jnp.argmin(largest_residual, axis=0)[None, None]
         c_of_best = jnp.take_along_axis(c, best_degree, 1)
         residual_of_best = jnp.take_along_axis(residual, best_degree, 1)
-        factor = jnp.asarray(_factor_near_edge(x), residual.dtype)
-        correction = residual_of_best * factor[:, None, None, None]
+        # The correction falls from the whole residual in the middle of the grid to zero at
+        # its edge. Along each axis, the fall has two vanishing derivatives at both ends.
+        fall = np.clip((np.abs(x) - _START_OF_FALL) / (1 - _START_OF_FALL), 0, 1)
+        factors = np.prod(1 - fall**3 * (10 - 15 * fall + 6 * fall**2), axis=1)
+        factors = jnp.asarray(factors, residual.dtype)
+        correction = residual_of_best * factors[:, None, None, None]
         return jnp.concatenate([c_of_best, correction])
 
     def value_at(self, frame, y, c):
@@ -206,57 +213,15 @@ class Grid(AbstractBasis):
         values_on_grid = c.reshape(*[n] * self.d, *value_shape)
         block_shape = *[_STENCIL] * self.d, *value_shape
         block = lax.dynamic_slice(values_on_grid, start_indices, block_shape)
+        # The Lagrange polynomials of the interpolation points.
         distances = [safe_position - begin - j for j in range(_STENCIL)]
-        weights = _lagrange_polynomials(distances)
+        weights = []
+        for j in range(_STENCIL):
+            others = [k for k in range(_STENCIL) if k != j]
+            product = ft.reduce(jnp.multiply, [distances[k] for k in others])
+            weights.append(product / math.prod(j - k for k in others))
         # Each pass sums over the leading axis, which is the next axis of the grid.
         for axis in range(self.d):
             products = [weight[axis] * row for weight, row in zip(weights, block)]
             block = ft.reduce(jnp.add, products)
         return jnp.where(is_inside, block, 0)
-
-
-def _best_degree_near_edge(
-    x: Float[np.ndarray, "nodes d"], residual: Float[Array, "nodes degrees S m"]
-) -> Int[Array, "1 1 S m"]:
-    """The index of the degree that leaves the least near the edge of the grid, for each
-    time and component. `x` are the coordinates of the nodes."""
-    distance = np.max(np.abs(x), axis=1)
-    is_near_edge = (distance > _START_NEAR_EDGE) & (distance < _START_OF_FALL)
-    largest_residual = jnp.max(jnp.abs(residual[is_near_edge]), axis=0)
-    return jnp.argmin(largest_residual, axis=0)[None, None]
-
-
-def _factor_near_edge(x: Float[np.ndarray, "nodes d"]) -> Float[np.ndarray, " nodes"]:
-    """The factor of the correction at the nodes with these coordinates: one in the middle
-    of the grid, and zero at its edge."""
-    # From 0, where the correction starts to fall, to 1 at the edge, along each axis.
-    progress_of_fall = (np.abs(x) - _START_OF_FALL) / (1 - _START_OF_FALL)
-    return np.prod(_smooth_fall(progress_of_fall), axis=1)
-
-
-def _lagrange_polynomials(
-    distances: list[Float[Array, " d"]],
-) -> list[Float[Array, " d"]]:
-    """The Lagrange polynomials of the points `0, 1, ..., k - 1` at `x`, where `distances`
-    holds the distances `x`, `x - 1`, ..., `x - (k - 1)` of `x` to each of them."""
-    k = len(distances)
-    # Polynomial `j` is the product of the distances to all points but point `j`: to those
-    # before it, times to those after it.
-    before = [*itertools.accumulate(distances[:-1], jnp.multiply, initial=1.0)]
-    after = [*itertools.accumulate(distances[:0:-1], jnp.multiply, initial=1.0)][::-1]
-    polynomials = []
-    for j in range(k):
-        # It is divided by its value at point `j`, where it is to be one. There the
-        # distances before are `j, ..., 1`, and those after are `-1, ..., -(k - 1 - j)`.
-        num_after = k - 1 - j
-        sign = (-1) ** num_after
-        value_at_j = sign * (math.factorial(j) * math.factorial(num_after))
-        polynomials.append(before[j] * after[j] / value_at_j)
-    return polynomials
-
-
-def _smooth_fall(x: np.ndarray) -> np.ndarray:
-    """A function that falls from 1 at 0 to 0 at 1, with two vanishing derivatives at both
-    ends."""
-    x = np.clip(x, 0, 1)
-    return 1 - x**3 * (10 - 15 * x + 6 * x**2)

@@ -10,8 +10,7 @@ divided by its probability by the mixture of laws ([Hesterberg
 import collections
 import dataclasses
 import itertools
-from collections.abc import Callable
-from typing import TypeAlias
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -22,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
 from ..._brownian import Discrete, random_words
 from ..._simulation import Problem
 from ..._terms import number_of_noises
-from .noise import cuts_by, cuts_of, Noise, padded
+from .noise import cuts_of, Noise, padded
 
 
 # The share of the paths that draw by other laws. Weights are then at most
@@ -45,15 +44,11 @@ _HALVINGS = 30
 # or the other. Each further noise would double the number of laws.
 _MOST_NOISES_PUSHED = 2
 
-# Maps a law and the strength of a change to the probabilities that the law has after it.
-_ChangeOfLaw: TypeAlias = Callable[[Discrete, float], np.ndarray]
-
 
 class Mixture(eqx.Module):
     """The laws of the noise of paths, of which the first one is its own.
 
     - `shares`: the probability with which a path draws by each law.
-    - `cuts_of_laws`: the cuts between the random words that choose the laws.
     - `cuts`: the cuts between the random words that choose outcomes, as for `Noise.draw`,
         for each level and law.
     - `log_ratios`: for each level, law and random variable the logarithm of the probability
@@ -61,7 +56,6 @@ class Mixture(eqx.Module):
     """
 
     shares: Float[Array | np.ndarray, " laws"]
-    cuts_of_laws: UInt32[Array | np.ndarray, "1 cuts_of_laws"]
     cuts: UInt32[Array | np.ndarray, "levels laws n cuts"]
     log_ratios: Float[Array | np.ndarray, "levels laws n outcomes"]
 
@@ -71,46 +65,49 @@ class Mixture(eqx.Module):
         noise pushes to one side, in the order of `itertools.product`."""
         laws = Noise.of(problem, problem.level(0)).laws
         own = [np.array(law.probabilities) for law in laws]
-        # For each level. With a width of 1 all outcomes are equally probable.
-        widths = _strongest_change(problem, laws, _widened, most=1.0)
-        # By level, other law and variable: arrays of the probabilities of outcomes.
-        others = [[[_widened(law, width) for law in laws]] for width in widths]
         num_noises = number_of_noises(problem.terms)
+        all_signs = []
         if num_noises <= _MOST_NOISES_PUSHED:
-            tilts = _strongest_change(problem, laws, _tilted, most=_MOST_TILT)
-            # The increments come first. The other variables, which are only in products
-            # with them, are not tilted.
-            not_tilted = [0] * (len(laws) - num_noises)
-            for signs in itertools.product((-1, 1), repeat=num_noises):
-                signs_of_laws = [*signs, *not_tilted]
-                for of_level, tilt in zip(others, tilts):
-                    pairs = zip(laws, signs_of_laws)
-                    of_level.append([_tilted(law, sign * tilt) for law, sign in pairs])
+            all_signs = [*itertools.product((-1, 1), repeat=num_noises)]
+        # The increments come first. The other variables, which are only in products with
+        # them, are not tilted.
+        not_tilted = [0] * (len(laws) - num_noises)
 
-        def log_ratios(probabilities: list[np.ndarray]) -> np.ndarray:
-            return padded([np.log(p / p_own) for p, p_own in zip(probabilities, own)])
-
-        num_others = len(others[0])
-        shares = np.append(
-            1 - _SHARE_OF_OTHERS, np.full(num_others, _SHARE_OF_OTHERS / num_others)
-        )
+        cuts = []
+        log_ratios = []
+        num_steps = problem.levels.num_steps
+        # Each level, which has its own number of steps, has an equal part of the entropy.
+        for most_nats in _NATS / len(num_steps) / num_steps:
+            # With a width of 1 all outcomes are equally probable.
+            width = _strongest_change(laws, _widened, 1.0, most_nats)
+            # By law of the path and variable: the probabilities of outcomes.
+            probabilities = [own, [_widened(law, width) for law in laws]]
+            tilt = _strongest_change(laws, _tilted, _MOST_TILT, most_nats)
+            for signs in all_signs:
+                signed_laws = zip([*signs, *not_tilted], laws)
+                probabilities.append([_tilted(law, k * tilt) for k, law in signed_laws])
+            cuts.append([cuts_of(of_law) for of_law in probabilities])
+            log_ratios.append(
+                [
+                    padded([np.log(p / p_own) for p, p_own in zip(of_law, own)])
+                    for of_law in probabilities
+                ]
+            )
+        num_others = 1 + len(all_signs)
+        shares_of_others = np.full(num_others, _SHARE_OF_OTHERS / num_others)
         return Mixture(
-            shares=shares.astype(problem.dtype),
-            cuts_of_laws=cuts_by([shares]),
-            cuts=np.array(
-                [[cuts_of(laws), *map(cuts_by, of_level)] for of_level in others]
+            shares=np.append(1 - _SHARE_OF_OTHERS, shares_of_others).astype(
+                problem.dtype
             ),
-            log_ratios=np.array(
-                [[*map(log_ratios, [own, *of_level])] for of_level in others],
-                problem.dtype,
-            ),
+            cuts=np.array(cuts),
+            log_ratios=np.array(log_ratios, problem.dtype),
         )
 
     def own_law_alone(self) -> "Mixture":
         """The mixture in which all paths draw by their own law."""
         shares = np.zeros_like(self.shares)
         shares[0] = 1
-        return dataclasses.replace(self, shares=shares, cuts_of_laws=cuts_by([shares]))
+        return dataclasses.replace(self, shares=shares)
 
     def draw_law(self, key: PRNGKeyArray) -> Int[Array, ""]:
         """The number of the law by which the path with this key draws, on all levels."""
@@ -118,7 +115,9 @@ class Mixture(eqx.Module):
         # noise of steps has other words.
         place = jnp.array(0), jnp.array(len(self.cuts))
         (words,) = random_words(key, place, 1, 1)
-        return jnp.sum(words >= self.cuts_of_laws)
+        uniform = words.astype(self.shares.dtype) / 2.0**32
+        # Not `>=`, since in single precision the largest words are rounded to one.
+        return jnp.sum(uniform > jnp.cumsum(self.shares)[:-1])
 
     def weights(self, log_ratios: Float[Array, "paths laws"]) -> Float[Array, " paths"]:
         """The likelihood ratios of paths: the probability of their noise by its own law,
@@ -152,47 +151,26 @@ def _tilted(law: Discrete, tilt: float) -> np.ndarray:
 
 
 def _strongest_change(
-    problem: Problem,
-    laws: tuple[Discrete, ...],
-    changed_probabilities: _ChangeOfLaw,
+    laws: Sequence[Discrete],
+    changed_probabilities: Callable[[Discrete, float], np.ndarray],
     most: float,
-) -> Float[np.ndarray, " levels"]:
-    """For each level the largest strength, up to `most`, for which the probabilities
-    `changed_probabilities(law, strength)` give all variables of a path, on all levels
-    together, a relative entropy of at most `_NATS` with respect to their own laws. (The
-    relative entropy grows with the strength.)"""
-    num_steps = problem.levels.num_steps
+    most_nats: float,
+) -> float:
+    """The largest strength, up to `most`, for which the probabilities
+    `changed_probabilities(law, strength)` give the variables of a step together a relative
+    entropy of at most `most_nats` with respect to their own laws: the sum of
+    `changed * log(changed / own)` over all outcomes, which grows with the strength."""
     law_counts = collections.Counter(laws)
-    # Each level, which has its own number of steps, has an equal part of the entropy.
-    most_nats = _NATS / len(num_steps)
-    # The bisection of all levels at once.
-    lower = np.zeros(len(num_steps))
-    upper = np.full(len(num_steps), most)
+    lower = 0.0
+    upper = most
     for _ in range(_HALVINGS):
         middle = (lower + upper) / 2
-        nats_of_step = np.array(
-            [
-                _relative_entropy(law_counts, changed_probabilities, strength)
-                for strength in middle
-            ]
-        )
-        is_too_much = num_steps * nats_of_step > most_nats
-        lower = np.where(is_too_much, lower, middle)
-        upper = np.where(is_too_much, middle, upper)
+        nats = 0.0
+        for law, count in law_counts.items():
+            changed = changed_probabilities(law, middle)
+            nats += count * np.sum(changed * np.log(changed / law.probabilities))
+        if nats > most_nats:
+            upper = middle
+        else:
+            lower = middle
     return lower
-
-
-def _relative_entropy(
-    law_counts: collections.Counter[Discrete],
-    changed_probabilities: _ChangeOfLaw,
-    strength: float,
-) -> float:
-    """The relative entropy of the variables of a step, so many of each law, after a change
-    of this strength: the sum of `changed * log(changed / own)` over the probabilities of
-    all outcomes, in nats."""
-    nats = 0.0
-    for law, count in law_counts.items():
-        own = np.array(law.probabilities)
-        changed = changed_probabilities(law, strength)
-        nats += count * np.sum(changed * np.log(changed / own))
-    return nats

@@ -1,9 +1,10 @@
 """The random variables of a step, and expectations over them."""
 
 import dataclasses
+import functools as ft
 import math
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import equinox as eqx
 import jax
@@ -27,30 +28,11 @@ _MOST_OUTCOMES = 100
 Function: TypeAlias = Callable[[Y], Array]
 
 
-class WeightedNodes(NamedTuple):
-    """Values of the random variables of a step, and weights by which the expectation of any
-    function of them is a sum over these values.
-
-    - `nodes`: the values of all variables, along the last axis.
-    - `weights`: the weight of each node: its probability, if the nodes are all outcomes.
-    """
-
-    nodes: Float[Array | np.ndarray, "K n"]
-    weights: Float[np.ndarray, " K"]
-
-
-class StepOfPath(NamedTuple):
-    """A path after a step, from `Noise.advance`.
-
-    - `y`, `solver_state`: the states of the path and of the solver.
-    - `success`: whether the step succeeded.
-    - `control`: its control variate, whose mean over the step's random variables is zero.
-    """
-
-    y: Y
-    solver_state: PyTree[Array]
-    success: Bool[Array, ""]
-    control: Array
+# Values of the random variables of a step, those of all variables along the last axis, and
+# weights by which the expectation of any function of them is a sum over these values.
+WeightedNodes: TypeAlias = tuple[
+    Float[Array | np.ndarray, "K n"], Float[np.ndarray, " K"]
+]
 
 
 class Noise(eqx.Module):
@@ -67,8 +49,7 @@ class Noise(eqx.Module):
     problem: Problem
     level: Level
     laws: tuple[Discrete, ...] = eqx.field(static=True)
-    # The outcomes of a step (of all variables together) with their probabilities, if there
-    # are few outcomes.
+    # All outcomes of a step with their probabilities, if there are few outcomes.
     outcomes: WeightedNodes | None
 
     @staticmethod
@@ -83,12 +64,11 @@ class Noise(eqx.Module):
                 "increments have infinitely many. Use a `WeakBrownianPath` in place of the "
                 "path in `terms`, or pass `sampling=ArrayRQMC(num_paths)`."
             )
-        num_outcomes = math.prod(len(law.values) for law in discrete_laws)
-        if num_outcomes > _MOST_OUTCOMES:
-            return Noise(problem, level, discrete_laws, outcomes=None)
-        # Only Gaussian variables have nodes, of which there are none here.
-        values, probabilities = outcomes(discrete_laws, num_nodes=1)
-        few_outcomes = WeightedNodes(values.astype(problem.dtype), probabilities)
+        few_outcomes = None
+        if math.prod(len(law.values) for law in discrete_laws) <= _MOST_OUTCOMES:
+            # Only Gaussian variables have nodes, of which there are none here.
+            values, probabilities = outcomes(discrete_laws, num_nodes=1)
+            few_outcomes = values.astype(problem.dtype), probabilities
         return Noise(problem, level, discrete_laws, few_outcomes)
 
     def with_args(self, own_args: PyTree[Array]) -> "Noise":
@@ -123,7 +103,7 @@ class Noise(eqx.Module):
             return self.outcomes
         if x is not None:
             # The mean over a draw and its opposite is right for all odd functions.
-            return WeightedNodes(jnp.stack([x, -x]), np.full(2, 0.5))
+            return jnp.stack([x, -x]), np.full(2, 0.5)
         # Two nodes along each axis, at `sqrt(3)` standard deviations with weight 1/6, as in
         # Gauss-Hermite quadrature, and zero, with the remainder of a total weight of one.
         # They are exact for polynomials of degree 3, or 5 in one variable.
@@ -131,7 +111,7 @@ class Noise(eqx.Module):
         nodes_on_axes = np.diag(np.sqrt(3 * self._variances()))
         nodes = np.concatenate([nodes_on_axes, -nodes_on_axes, np.zeros((1, n))])
         weights = np.append(np.full(2 * n, 1 / 6), 1 - n / 3)
-        return WeightedNodes(nodes.astype(self.problem.dtype), weights)
+        return nodes.astype(self.problem.dtype), weights
 
     def mean(self, i: Any, y: Y, u: Function, x: Array | None = None) -> Array:
         """The expectation of `u` after step `i` from `y`, over `weighted_nodes(x)`; NaN if
@@ -154,61 +134,37 @@ class Noise(eqx.Module):
         u: Function,
         second_derivatives: Array | None,
         x: Array,
-    ) -> StepOfPath:
-        """Step `i` of a path with variables `x`, and the control variate of `u` in it.
-        `second_derivatives` comes from `mean_second_derivatives`."""
-        if self.outcomes is None:
-            assert second_derivatives is not None
-            return self._advance_by_derivatives(
-                i, y, solver_state, u, second_derivatives, x
+    ) -> tuple[Y, PyTree[Array], Bool[Array, ""], Array]:
+        """Step `i` of a path with variables `x`: the states of the path and of the solver
+        after it, whether it succeeded, and the control variate of `u`, whose mean over `x`
+        is zero. `second_derivatives` comes from `mean_second_derivatives`."""
+        if self.outcomes is not None:
+            outcomes_of_x, probabilities = self.outcomes
+            # A step for each outcome: the states of the path and of the solver after it.
+            step_by_outcome = jax.vmap(lambda x: self.step(i, y, solver_state, x))
+            ends, solver_states, success = step_by_outcome(outcomes_of_x)
+            values = jax.vmap(u)(ends)
+            mean = tensordot(probabilities.astype(values.dtype), values, 1)
+            # The path itself takes the outcome that is equal to `x`.
+            index_of_x = jnp.argmax(jnp.all(outcomes_of_x == x, axis=1))
+            y1, next_solver_state, value = jtu.tree_map(
+                lambda of_outcomes: of_outcomes[index_of_x],
+                (ends, solver_states, values),
             )
-        outcomes_of_x, probabilities = self.outcomes
-        # A step for each outcome: the states of the path and of the solver after it.
-        step_by_outcome = jax.vmap(lambda x: self.step(i, y, solver_state, x))
-        ends, solver_states, success = step_by_outcome(outcomes_of_x)
-        values = jax.vmap(u)(ends)
-        # The path itself takes the outcome that is equal to `x`.
-        index_of_x = jnp.argmax(jnp.all(outcomes_of_x == x, axis=1))
-        mean = tensordot(probabilities.astype(values.dtype), values, 1)
-        y1, solver_state_after, value = jtu.tree_map(
-            lambda of_outcomes: of_outcomes[index_of_x], (ends, solver_states, values)
-        )
-        # One failed outcome makes the mean wrong, and with it the control variate.
-        return StepOfPath(
-            y=y1,
-            solver_state=solver_state_after,
-            success=jnp.all(success),
-            control=value - mean,
-        )
+            # One failed outcome makes the mean wrong, and with it the control variate.
+            return y1, next_solver_state, jnp.all(success), value - mean
 
-    def _advance_by_derivatives(
-        self,
-        i: Any,
-        y: Y,
-        solver_state: PyTree[Array],
-        u: Function,
-        second_derivatives: Array,
-        x: Array,
-    ) -> StepOfPath:
-        """`advance` for many outcomes, by the formula of this class."""
-        y1, solver_state_after, success = self.step(i, y, solver_state, x)
-
-        def u_after(x: Array) -> Array:
-            end, _, _ = self.step(i, y, solver_state, x)
-            return u(end)
-
-        first_derivatives = jax.jacrev(u_after)(jnp.zeros_like(x))
+        # By the formula of this class.
+        assert second_derivatives is not None
+        y1, next_solver_state, success = self.step(i, y, solver_state, x)
+        value_after = ft.partial(self._value_after, i, y, solver_state, u)
+        first_derivatives = jax.jacrev(value_after)(jnp.zeros_like(x))
         # The second derivatives `C`, multiplied by this matrix and summed over both axes,
         # are `x^T C x - tr(C Sigma)`.
         centred_square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
         linear = tensordot(first_derivatives, x, 1)
         quadratic = tensordot(centred_square, second_derivatives, 2) / 2
-        return StepOfPath(
-            y=y1,
-            solver_state=solver_state_after,
-            success=success,
-            control=linear + quadratic,
-        )
+        return y1, next_solver_state, success, linear + quadratic
 
     def mean_second_derivatives(self, i: Any, ys: Y, u: Function) -> Array | None:
         """The mean of the second derivatives of `u` after step `i` along the variables,
@@ -218,11 +174,9 @@ class Noise(eqx.Module):
         zero = jnp.zeros(len(self.laws), self.problem.dtype)
 
         def hessian(y: Y) -> Array:
-            def u_after(x: Array) -> Array:
-                end, _, _ = self.step(i, y, self.new_solver_state(i, y), x)
-                return u(end)
-
-            return jax.hessian(u_after)(zero)
+            solver_state = self.new_solver_state(i, y)
+            value_after = ft.partial(self._value_after, i, y, solver_state, u)
+            return jax.hessian(value_after)(zero)
 
         # One state after another, since a Hessian of many variables takes much memory.
         # (C, S, m, n, n)
@@ -230,23 +184,27 @@ class Noise(eqx.Module):
         # (n, n, C, S, m)
         return jnp.moveaxis(mean, (-2, -1), (0, 1))
 
+    def _value_after(
+        self, i: Any, y: Y, solver_state: PyTree[Array], u: Function, x: Array
+    ) -> Array:
+        """The value of `u` after step `i` with variables `x`."""
+        end, _, _ = self.step(i, y, solver_state, x)
+        return u(end)
+
     def step(
         self, i: Any, y: Y, solver_state: PyTree[Array], x: Array | np.ndarray
     ) -> tuple[Y, PyTree[Array], Bool[Array, ""]]:
         """`Problem.step` with these variables."""
-        terms = self._terms(x)
+        terms = self.problem.variables(self.level.h).terms_with(x)
         return self.problem.step(terms, i, self.level.h, y, solver_state)
 
     def new_solver_state(self, i: Any, y: Y) -> PyTree[Array]:
         """The state of a solver that starts at step `i`. It is used in fits, which affect
         only the variance; paths carry their own solver state."""
-        terms = self._terms(np.zeros(len(self.laws)))
+        no_noise = np.zeros(len(self.laws))
+        terms = self.problem.variables(self.level.h).terms_with(no_noise)
         solver_state = self.problem.init(terms, i, self.level.h, y)
         return jtu.tree_map(_hidden_if_result, solver_state)
-
-    def _terms(self, x: Any) -> PyTree:
-        """The terms with paths that give these variables in every step."""
-        return self.problem.variables(self.level.h).terms_with(x)
 
     def _variances(self) -> np.ndarray:
         """The variance of each variable. (All have mean zero.)"""
@@ -264,27 +222,17 @@ def _hidden_if_result(x: Array) -> Array:
     return jax.lax.optimization_barrier(x) if is_result else x
 
 
-def cuts_of(laws: Sequence[Discrete]) -> UInt32[np.ndarray, "n cuts"]:
-    """The cuts between the random words of the outcomes of variables with these laws, by
-    which a `WeakBrownianPath` draws, too."""
-    return _padded_cuts([np.array(law.cuts, float) for law in laws])
-
-
-def cuts_by(
-    probabilities: Sequence[Float[np.ndarray, " outcomes"]],
+def cuts_of(
+    probabilities: Sequence[Sequence[float] | Float[np.ndarray, " outcomes"]],
 ) -> UInt32[np.ndarray, "n cuts"]:
-    """The cuts for the probabilities of the outcomes of each variable."""
-    return _padded_cuts([np.cumsum(p)[:-1] * 2.0**32 for p in probabilities])
-
-
-def _padded_cuts(rows: Sequence[np.ndarray]) -> UInt32[np.ndarray, "n cuts"]:
-    """Rows of cuts as one array. Shorter rows are padded with the largest word, and cuts of
-    2^32, which is no word, are replaced by it. (The one random word that reaches this cut
-    has the number of an outcome past the last, which `padded` makes equal to the last.)"""
-    most = max(map(len, rows))
+    """The cuts between the random words of the outcomes of variables, from the
+    probabilities of the outcomes of each."""
+    cumulative = padded([np.cumsum(p) for p in probabilities])[:, :-1]
+    # A cut of 2^32 is no word, and the largest word takes its place. (The one random word
+    # that reaches this cut has the number of an outcome past the last, which `padded` makes
+    # equal to the last.)
     largest_word = np.iinfo(np.uint32).max
-    cuts = [np.pad(x, (0, most - len(x)), constant_values=largest_word) for x in rows]
-    return np.minimum(np.stack(cuts), largest_word).astype(np.uint32)
+    return np.minimum(np.round(cumulative * 2.0**32), largest_word).astype(np.uint32)
 
 
 def padded(rows: Sequence[np.ndarray]) -> np.ndarray:
@@ -299,4 +247,7 @@ def count_outcomes(problem: Problem) -> int | None:
         noise = Noise.of(problem, problem.level(0))
     except ValueError:
         return None
-    return None if noise.outcomes is None else len(noise.outcomes.weights)
+    if noise.outcomes is None:
+        return None
+    values, _ = noise.outcomes
+    return len(values)

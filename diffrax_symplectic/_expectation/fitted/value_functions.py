@@ -9,20 +9,18 @@ import dataclasses
 import functools as ft
 import warnings
 from collections.abc import Sequence
-from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Int, PRNGKeyArray
 
 from ..._arguments import check_memory, check_untraced, whole_number
-from ..._lapack import lapack_in_turn
-from ..._programs import compiled
 from ..._simulation import Combination, Problem
-from ..._solver import without_newton
+from ..._solver import has_newton, without_newton
 from ..estimate import combined_results, Expectation
 from ..run import run
 from ..sampling import (
@@ -33,16 +31,17 @@ from ..sampling import (
     saved_by_name,
 )
 from .bases import AbstractBasis
-from .basis_choice import chosen_basis, warn_of_long_fit
+from .basis_choice import chosen_basis
 from .controlled_paths import controlled_paths
-from .fits import Choice, fit, FittedFunctions
+from .fits import fit, FittedFunctions, room_for_steps
 from .mixture import Mixture
-from .noise import Noise
 
 
 # Folded into the key of a call to draw trials. (Numbers of levels, which are folded into it
 # to draw fits, are smaller.)
 _TRIAL_KEY = 0xFFFFFFFE
+# The most numbers that a fit computes without a warning that it will take long.
+_MOST_WITHOUT_WARNING = 2**31
 # From the code that calls `expectation` to `prepare`, counted as for `warnings.warn`.
 _FRAMES_TO_USER = 6
 
@@ -99,14 +98,21 @@ class ValueFunctions(AbstractSampling):
     def prepare(self, problem, key, devices):
         check_memory("batch_size", self.batch_size, problem.bytes_of_state, devices[0])
         chosen = chosen_basis(problem, self.degree)
-        warn_of_long_fit(chosen, stacklevel=_FRAMES_TO_USER)
+        if chosen.num_numbers > _MOST_WITHOUT_WARNING:
+            warnings.warn(
+                f"The fit of `ValueFunctions` takes as long as {chosen.num_states:,} "
+                "independent paths. If fewer paths are accurate enough, pass "
+                "`sampling=IndependentPaths(num_paths)`.",
+                stacklevel=_FRAMES_TO_USER,
+            )
         basis = chosen.basis
         outputs = Outputs.of(problem)
-        functions = _fits(problem, key, basis, range(len(problem.levels.h)))
+        levels = range(len(problem.levels.h))
+        functions = _fits(problem, key, basis, room_for_steps(problem), levels)
         mixture = Mixture.of(problem)
 
         def plan_for(
-            choice: Choice, mixture: Mixture, num_samples: int
+            choice: Int[np.ndarray, "S m"], mixture: Mixture, num_samples: int
         ) -> SamplingPlan:
             # A `Partial` is a PyTree: a program is compiled once for all arrays in it.
             sampler = jtu.Partial(controlled_paths, problem, functions, choice, mixture)
@@ -122,16 +128,15 @@ class ValueFunctions(AbstractSampling):
         # One trial for each candidate, on the same paths, which are not part of the
         # estimate.
         key_of_trials = jr.fold_in(key, _TRIAL_KEY)
-        trials_of_candidates = []
-        for candidate in range(len(basis.candidates)):
-            same_for_all = Choice.of_all(candidate, problem.output_shape)
+        trials = []
+        for number in range(1, len(basis.candidates) + 1):
+            same_for_all = np.full(problem.output_shape, number)
             plan = plan_for(same_for_all, mixture, self.batch_size)
-            trials_of_candidates.append(run(plan, key_of_trials, devices))
-        comparison = _comparison(trials_of_candidates, problem.output_shape)
-        choice = comparison.choice
+            trials.append(run(plan, key_of_trials, devices))
+        choice, remainder = _comparison(trials, problem)
         if self.degree == 0:
-            choice = choice._replace(used=np.zeros_like(choice.used))
-        if self.degree and not np.any(choice.used):
+            choice = np.zeros_like(choice)
+        if self.degree and not np.any(choice):
             warnings.warn(
                 f"`degree={self.degree}` is no better than no control variate, so none is "
                 "used. Pass another `degree`, or another `sampling`.",
@@ -139,17 +144,26 @@ class ValueFunctions(AbstractSampling):
             )
         # If paths fail, those of the other laws, which go further out, fail far more often,
         # and show nothing of the rare paths for which they are there.
-        some_fail = any(trial.num_failed > 0 for trial in trials_of_candidates)
-        if some_fail or not np.any(choice.used):
+        if any(trial.num_failed > 0 for trial in trials) or not np.any(choice):
             mixture = mixture.own_law_alone()
         plan = plan_for(choice, mixture, self.num_paths)
+        # Without a control variate, the candidate is zero.
+        options = np.array([0, *basis.candidates])
         return plan._replace(
-            reason=_reason(basis, choice),
-            remainder=comparison.remainder(problem.dtype),
+            reason=(
+                f"{basis.candidate_name}: {_listed(options[choice])}, chosen among "
+                f"{_listed(options)}"
+            ),
+            remainder=remainder,
             with_halved_steps=(
                 ft.partial(_with_halved_steps, plan, key) if chosen.is_quick else None
             ),
         )
+
+
+def _listed(options: np.ndarray) -> str:
+    """The options, each of them once, such as `0, 2, 4`."""
+    return ", ".join(map(str, np.unique(options)))
 
 
 def _with_halved_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
@@ -157,109 +171,64 @@ def _with_halved_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
     fitted: each other level now has the steps of the one after it, and takes its fit."""
     problem, functions, *others = plan.sampler.args  # pyright: ignore (a `Partial`)
     finer_problem = problem.with_halved_steps()
-    last_level = len(problem.levels.h) - 1
-    last_functions = _fits(finer_problem, key, functions.basis, [last_level])
+    num_levels, most_steps, *_ = functions.coefficients.shape
+    last_functions = _fits(
+        finer_problem, key, functions.basis, most_steps, [num_levels - 1]
+    )
     known_functions = jtu.tree_map(lambda x: x[1:], functions)
     finer_functions = _joined([known_functions, last_functions])
     sampler = jtu.Partial(controlled_paths, finer_problem, finer_functions, *others)
     return plan._replace(sampler=sampler)
 
 
-class _Comparison(NamedTuple):
-    """The candidates, compared by their trials, with axes for times and components.
-
-    - `choice`: the best candidates, and where they are better than none.
-    - `least_errors`: the standard errors with them.
-    - `plain_errors`: the standard errors without a control variate.
-    - `mean`: the mean.
-    """
-
-    choice: Choice
-    least_errors: Float[np.ndarray, "S m"]
-    plain_errors: Float[np.ndarray, "S m"]
-    mean: Float[np.ndarray, "S m"]
-
-    def remainder(self, dtype: Any) -> float:
-        """The largest fraction of a standard error that remains with control."""
-        # Where nothing is random, as for a constant `phi`, both errors are rounding errors.
-        rounding = ROUNDING * jnp.finfo(dtype).eps * np.abs(self.mean)
-        is_random = self.plain_errors > rounding
-        errors = np.minimum(self.least_errors, self.plain_errors)
-        fractions = errors / np.where(is_random, self.plain_errors, 1)
-        return float(np.max(np.where(is_random, fractions, 0), initial=0.0))
-
-
 def _comparison(
-    trials_of_candidates: list[Expectation], output_shape: tuple[int, int]
-) -> _Comparison:
-    """Compares the candidates, by a trial of each."""
-    results_of_candidates = [
-        combined_results(trial, Combination.BEST) for trial in trials_of_candidates
-    ]
-    # (C, S, m)
-    errors = np.stack(
-        [result.std_error.reshape(output_shape) for result in results_of_candidates]
-    )
-    # A candidate whose error is NaN has failed.
-    errors = np.nan_to_num(errors, nan=np.inf)
+    trials: list[Expectation], problem: Problem
+) -> tuple[Int[np.ndarray, "S m"], float]:
+    """Compares the candidates, by a trial of each. The number of the best candidate for
+    each time and component, counted from 1, or 0 where none is better than none; and the
+    largest fraction of a standard error that remains with them."""
+    results = [combined_results(trial, Combination.BEST) for trial in trials]
+    # (C, S * m). A candidate whose error is NaN has failed.
+    errors = np.nan_to_num([result.std_error for result in results], nan=np.inf)
     least_errors = np.min(errors, axis=0)
     # The trials have the same paths, so without control their results are the same.
-    first, *_ = results_of_candidates
-    plain_errors = first.plain_std_error.reshape(output_shape)
-    # Written as a negation, so that a fit is used if the error without it is NaN.
+    plain_errors = results[0].plain_std_error
     is_no_better = least_errors >= plain_errors
-    return _Comparison(
-        choice=Choice(best=np.argmin(errors, axis=0), used=~is_no_better),
-        least_errors=least_errors,
-        plain_errors=plain_errors,
-        mean=first.mean.reshape(output_shape),
-    )
-
-
-def _reason(basis: AbstractBasis, choice: Choice) -> str:
-    """Which candidates were chosen, with zero for none, such as
-    `degree: 2, 4, chosen among 0, 2, 4`."""
-    # Zero stands for no control variate, so candidate `k` is option `k + 1`.
-    options = np.array([0, *basis.candidates])
-    chosen = np.unique(options[np.where(choice.used, choice.best + 1, 0)])
-    return (
-        f"{basis.candidate_name}: {', '.join(map(str, chosen))}, chosen among "
-        f"{', '.join(map(str, np.unique(options)))}"
-    )
+    choice = np.where(is_no_better, 0, 1 + np.argmin(errors, axis=0))
+    # Where nothing is random, as for a constant `phi`, both errors are rounding errors.
+    rounding = ROUNDING * np.finfo(problem.dtype).eps * np.abs(results[0].mean)
+    is_random = plain_errors > rounding
+    fractions = np.minimum(least_errors, plain_errors)[is_random]
+    fractions = fractions / plain_errors[is_random]
+    return choice.reshape(problem.output_shape), float(np.max(fractions, initial=0.0))
 
 
 def _fits(
-    problem: Problem, key: PRNGKeyArray, basis: AbstractBasis, levels: Sequence[int]
+    problem: Problem,
+    key: PRNGKeyArray,
+    basis: AbstractBasis,
+    most_steps: int,
+    levels: Sequence[int],
 ) -> FittedFunctions:
-    """The fits of levels with these numbers."""
+    """The fits of levels with these numbers, in arrays for `most_steps` steps."""
+
+    def fits_by(solver: diffrax.AbstractSolver) -> tuple[FittedFunctions, int]:
+        """The fits by this solver, and how many of the pilot's paths failed."""
+        solved = dataclasses.replace(problem, solver=solver)
+        # An integer would be static: a program for each level.
+        fits = [fit(solved, np.array(k), key, basis, most_steps) for k in levels]
+        functions_of_levels, failures_of_levels = zip(*fits)
+        # The numbers are traced if a function of the user closes over traced values.
+        check_untraced("`expectation`", failures_of_levels)
+        return _joined(functions_of_levels), sum(map(int, failures_of_levels))
+
     # Newton's method is a quarter of the time to compile a fit, and few of its states need
-    # it. A state at which the sweeps fail is left out of the fit.
-    sweeps_only = dataclasses.replace(problem, solver=without_newton(problem.solver))
-    functions, num_failed = _fits_and_failures(sweeps_only, key, basis, levels)
-    has_no_newton = eqx.tree_equal(sweeps_only.solver, problem.solver)
-    if num_failed == 0 or has_no_newton:
-        return functions
-    # If paths of the pilot fail, steps are too long for sweeps: the fit is made again, with
-    # Newton's method.
-    functions, _ = _fits_and_failures(problem, key, basis, levels)
+    # it. A state at which the sweeps fail is left out of the fit. But if paths of the pilot
+    # fail, steps are too long for sweeps: the fit is made again, with Newton's method.
+    functions, num_failed = fits_by(without_newton(problem.solver))
+    if num_failed > 0 and has_newton(problem.solver):
+        functions, _ = fits_by(problem.solver)
     return functions
-
-
-def _fits_and_failures(
-    problem: Problem, key: PRNGKeyArray, basis: AbstractBasis, levels: Sequence[int]
-) -> tuple[FittedFunctions, int]:
-    """The fits of levels, and how many of the pilot's paths failed."""
-    functions_of_levels = []
-    failures_of_levels = []
-    for index in levels:
-        # An integer would be static: a program for each level. Its shape keeps the axis of
-        # levels, along which the fits are joined.
-        functions, num_failed = _fit_of_level(problem, np.array([index]), key, basis)
-        functions_of_levels.append(functions)
-        failures_of_levels.append(num_failed)
-    # The numbers are traced if a function of the user closes over traced values.
-    check_untraced("`expectation`", failures_of_levels)
-    return _joined(functions_of_levels), sum(map(int, failures_of_levels))
 
 
 def _joined(functions_of_levels: Sequence[FittedFunctions]) -> FittedFunctions:
@@ -267,16 +236,3 @@ def _joined(functions_of_levels: Sequence[FittedFunctions]) -> FittedFunctions:
     if len(functions_of_levels) == 1:
         return functions_of_levels[0]
     return jtu.tree_map(lambda *xs: jnp.concatenate(xs), *functions_of_levels)
-
-
-@ft.partial(compiled, quickly=True)
-@lapack_in_turn
-def _fit_of_level(
-    problem: Problem, index: Int[Array, "1"], key: PRNGKeyArray, basis: AbstractBasis
-) -> tuple[FittedFunctions, Int[Array, ""]]:
-    """The fit of the level with this index, with a leading axis of levels, and how many of
-    the pilot's paths failed."""
-    level = problem.level(index[0])
-    key_of_level = jr.fold_in(key, index[0])
-    functions, num_failed = fit(Noise.of(problem, level), key_of_level, basis)
-    return jtu.tree_map(lambda x: x[None], functions), num_failed

@@ -1,6 +1,5 @@
 """Array-RQMC: all paths of a randomization step together, sorted before each step."""
 
-import functools as ft
 import math
 import warnings
 from collections.abc import Callable
@@ -12,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
-from jaxtyping import Array, ArrayLike, Bool, Float, Key, PRNGKeyArray, PyTree, UInt32
+from jaxtyping import Array, ArrayLike, Bool, Float, Key, PyTree, UInt32
 
 from ..._arguments import check_memory, check_real, check_takes, whole_number
 from ..._brownian import (
@@ -31,7 +30,6 @@ from ..._simulation import (
     Level,
     mask_like,
     Motion,
-    PathStates,
     Problem,
     real_vector,
     simulate,
@@ -62,25 +60,6 @@ _FEWEST_ALONG_COORDINATE = 3
 # Folded into the key of a replicate to draw the starts of its paths. (Numbers of levels are
 # smaller.)
 _KEY_OF_STARTS = 0xFFFFFFFF
-
-
-def _warn_of_many_coordinates(
-    num_paths: int, num_coordinates: int, stacklevel: int
-) -> None:
-    """Warns if paths that are sorted by so many coordinates are far from their
-    neighbours."""
-    # If the paths fill a cube, with equal distances along all coordinates.
-    num_along_coordinate = num_paths ** (1 / num_coordinates)
-    if num_along_coordinate < _FEWEST_ALONG_COORDINATE:
-        most_coordinates = int(math.log(num_paths, _FEWEST_ALONG_COORDINATE))
-        warnings.warn(
-            f"{num_paths:,} paths are sorted by {num_coordinates} coordinates, which "
-            f"leaves {num_along_coordinate:.1f} along each: neighbours are far apart, and "
-            "`ArrayRQMC` gains little over `IndependentPaths`. Pass a `sort_by` that "
-            "returns the few coordinates that matter most, at most "
-            f"{most_coordinates}.",
-            stacklevel=stacklevel + 1,
-        )
 
 
 @saved_by_name
@@ -133,24 +112,36 @@ class ArrayRQMC(AbstractSampling):
         check_real("sort_by", jtu.tree_leaves(coordinates))
         num_coordinates = jax.eval_shape(lambda: real_vector(sort_by(problem.y0))).size
         check_memory("num_paths", self.num_paths, problem.bytes_of_state, devices[0])
-        points = jnp.asarray(sobol_points(self.num_paths, layout.num_words))
-        _warn_of_many_coordinates(self.num_paths, num_coordinates, stacklevel=6)
-
-        def plan_for(any_steps: Problem) -> SamplingPlan:
-            return SamplingPlan(
-                jtu.Partial(_samples_of_replicate, any_steps, sort_by, points, layout),
-                Outputs.of(any_steps),
-                num_samples=self.replicates,
-                # All paths of a replicate are solved at once, which is a batch already.
-                batch_size=1,
-                paths_per_sample=self.num_paths,
-                least_samples=_LEAST_REPLICATES,
+        # If the paths fill a cube, with equal distances along all coordinates.
+        num_along_coordinate = self.num_paths ** (1 / num_coordinates)
+        if num_along_coordinate < _FEWEST_ALONG_COORDINATE:
+            most_coordinates = int(math.log(self.num_paths, _FEWEST_ALONG_COORDINATE))
+            warnings.warn(
+                f"{self.num_paths:,} paths are sorted by {num_coordinates} coordinates, "
+                f"which leaves {num_along_coordinate:.1f} along each: neighbours are far "
+                "apart, and `ArrayRQMC` gains little over `IndependentPaths`. Pass a "
+                "`sort_by` that returns the few coordinates that matter most, at most "
+                f"{most_coordinates}.",
+                stacklevel=6,
             )
+        points = jnp.asarray(sobol_points(self.num_paths, layout.num_words))
 
+        def sampler_for(problem: Problem) -> jtu.Partial:
+            return jtu.Partial(_samples_of_replicate, problem, sort_by, points, layout)
+
+        plan = SamplingPlan(
+            sampler_for(problem),
+            Outputs.of(problem),
+            num_samples=self.replicates,
+            # All paths of a replicate are solved at once, which is a batch already.
+            batch_size=1,
+            paths_per_sample=self.num_paths,
+            least_samples=_LEAST_REPLICATES,
+        )
         # With halved steps the program is the same.
-        any_steps = problem.with_any_steps()
-        with_halved_steps = ft.partial(plan_for, any_steps.with_halved_steps())
-        return plan_for(any_steps)._replace(with_halved_steps=with_halved_steps)
+        finer_sampler = sampler_for(problem.with_halved_steps())
+        finer_plan = plan._replace(sampler=finer_sampler)
+        return plan._replace(with_halved_steps=lambda: finer_plan)
 
 
 def _samples_of_replicate(
@@ -166,7 +157,7 @@ def _samples_of_replicate(
     `points` come from `sobol_points`, one for each path, with a coordinate for each random
     variable of a step.
     """
-    n, _ = points.shape
+    n, d = points.shape
     (replicate_key,) = keys
     # Starts are independent, rather than from Sobol' points, since a function of a key may
     # draw any number of random variables.
@@ -175,6 +166,17 @@ def _samples_of_replicate(
 
     def motion_on(level: Level) -> Motion:
         """The motion of all paths, which are sorted before each step."""
+
+        def words_of_paths(i: Any) -> UInt32[Array, "n d"]:
+            # The points are scrambled anew on each level and in each step.
+            key = jr.fold_in(jr.fold_in(replicate_key, level.index), i)
+            seeds = jr.bits(key, (num_seeds(d),), jnp.uint32)
+            # The outer values of this variable have probability 1/6 each, but a sixth of a
+            # power of two of points is not a whole number.
+            if layout.is_one_three_point_variable:
+                return balanced_in_sixths(points, seeds)
+            return scrambled(points, seeds)
+
         # Given their words, paths move independently. Only the words are coupled: a sorted
         # path gets those of its place in the order.
         motion = independent_motion(
@@ -182,13 +184,14 @@ def _samples_of_replicate(
             level,
             starts,
             terms_of=lambda words: with_words(problem.terms, layout, words),
-            randomness_of_step=ft.partial(
-                _words_of_paths, replicate_key, level, points, layout
-            ),
+            randomness_of_step=words_of_paths,
         )
 
         def step(i, paths):
-            return motion.step(i, _sorted_paths(sort_by, paths))
+            coordinates = jax.vmap(lambda y: real_vector(sort_by(y)))(paths.y)
+            # Failed paths come last.
+            order = hilbert_order(coordinates, paths.failed)
+            return motion.step(i, jtu.tree_map(lambda x: x[order], paths))
 
         return Motion(step, motion.start)
 
@@ -211,34 +214,6 @@ def _samples_of_replicate(
     # A level on which all paths fail has no mean.
     has_mean = jnp.all(num_failed < n, axis=0)
     return Samples(averaged, good=has_mean, num_failed=num_failed)
-
-
-def _words_of_paths(
-    replicate_key: PRNGKeyArray,
-    level: Level,
-    points: UInt32[Array, "n d"],
-    layout: "WordLayout",
-    i: Any,
-) -> UInt32[Array, "n d"]:
-    """The random words of each path in step `i`: the points, scrambled anew on each level
-    and in each step."""
-    key = jr.fold_in(jr.fold_in(replicate_key, level.index), i)
-    _, d = points.shape
-    seeds = jr.bits(key, (num_seeds(d),), jnp.uint32)
-    # The outer values of this variable have probability 1/6 each, but a sixth of a power of
-    # two of points is not a whole number.
-    if layout.is_one_three_point_variable:
-        return balanced_in_sixths(points, seeds)
-    return scrambled(points, seeds)
-
-
-def _sorted_paths(
-    sort_by: Callable[[Y], PyTree[Array]], paths: PathStates
-) -> PathStates:
-    """The paths in order along Hilbert's curve, with failed paths at the end."""
-    coordinates = jax.vmap(lambda y: real_vector(sort_by(y)))(paths.y)
-    order = hilbert_order(coordinates, paths.failed)
-    return jtu.tree_map(lambda x: x[order], paths)
 
 
 def _statistics(phi: Float[Array, "n m"], failed: Bool[Array, " n"]) -> Array:

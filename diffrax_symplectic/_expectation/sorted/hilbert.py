@@ -27,39 +27,23 @@ def hilbert_order(
 ) -> Int32[Array, " n"]:
     """The indices of the rows of `z`, the coordinates of states, in order along Hilbert's
     curve, with the rows marked `is_last` at the end."""
-    has_64_bits = jnp.result_type(float) == np.float64
-    return (
-        _order_by_64_bits(z, is_last) if has_64_bits else _order_by_32_bits(z, is_last)
-    )
+    n, _ = z.shape
+    rows = jnp.arange(n, dtype=jnp.int32)
+    if jnp.result_type(float) == np.float32:
+        bits = _BITS_OF_UINT32
+        places = _places_on_curve(_cells(z, bits), bits, jnp.uint32)
+        # Beyond all places on the curve.
+        places = jnp.where(is_last, np.uint32(2**bits), places)
+        _, order = lax.sort((places, rows), num_keys=1)
+        return order
 
-
-def _order_by_32_bits(
-    z: Float[Array, "n d"], is_last: Bool[Array, " n"]
-) -> Int32[Array, " n"]:
-    """`hilbert_order` by 32-bit integers."""
-    bits = _BITS_OF_UINT32
-    places = _places_on_curve(_cells(z, bits), bits, jnp.uint32)
-    # Beyond all places on the curve.
-    places = jnp.where(is_last, np.uint32(2**bits), places)
-    rows = jnp.arange(len(z), dtype=jnp.int32)
-    _, order = lax.sort((places, rows), num_keys=1)
-    return order
-
-
-def _order_by_64_bits(
-    z: Float[Array, "n d"], is_last: Bool[Array, " n"]
-) -> Int32[Array, " n"]:
-    """`hilbert_order` by 64-bit integers."""
     # On CPUs XLA sorts a single array of unsigned integers ten times as fast as anything
     # else, so the row's number is packed into the bits below its place on the curve.
-    n, _ = z.shape
     row_bits = (n - 1).bit_length()
-    place_bits = _BITS_OF_UINT64 - row_bits
-    places = _places_on_curve(_cells(z, place_bits), place_bits, jnp.uint64)
-    # Beyond all places on the curve.
-    places = jnp.where(is_last, np.uint64(2**place_bits), places)
-    packed = (places << np.uint64(row_bits)) | jnp.arange(n, dtype=jnp.uint64)
-    packed = jnp.sort(packed)
+    bits = _BITS_OF_UINT64 - row_bits
+    places = _places_on_curve(_cells(z, bits), bits, jnp.uint64)
+    places = jnp.where(is_last, np.uint64(2**bits), places)
+    packed = jnp.sort((places << np.uint64(row_bits)) | rows.astype(jnp.uint64))
     return (packed & np.uint64(2**row_bits - 1)).astype(jnp.int32)
 
 

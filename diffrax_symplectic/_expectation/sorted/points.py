@@ -1,7 +1,6 @@
 """Randomized low-discrepancy points, as random 32-bit words."""
 
 import functools as ft
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -122,42 +121,12 @@ def _reverse_bits(words: UInt32[Array, "..."]) -> UInt32[Array, "..."]:
     return (words >> np.uint32(16)) | (words << np.uint32(16))
 
 
-class _Seeds(NamedTuple):
-    """The random words of one randomization.
-
-    - `of_indices`: scrambles the indices of the points.
-    - `of_coordinates`: scramble the coordinates.
-    - `shifts`: shift the coordinates.
-    - `first_index`: for `balanced_in_sixths`, the index of the first point.
-    - `place_in_block`: for `balanced_in_sixths`, the place of this point in its block.
-    """
-
-    of_indices: UInt32[Array, ""]
-    of_coordinates: UInt32[Array, " d"]
-    shifts: UInt32[Array, " d"]
-    first_index: UInt32[Array, ""]
-    place_in_block: UInt32[Array, ""]
-
-    @staticmethod
-    def of(words: UInt32[Array, " s"], dimension: int) -> "_Seeds":
-        """The seeds from `num_seeds(dimension)` random words."""
-        return _Seeds(
-            of_indices=words[0],
-            of_coordinates=words[1 : 1 + dimension],
-            shifts=words[1 + dimension : 1 + 2 * dimension],
-            first_index=words[-2],
-            place_in_block=words[-1],
-        )
-
-
 def num_seeds(dimension: int) -> int:
-    """The number of random words that a randomization needs, as in `_Seeds`."""
-    for_indices = 1
-    # One to scramble each coordinate, and one to shift it.
-    for_coordinates = 2 * dimension
-    # One for the first index, and one for its place in a block.
-    for_blocks = 2
-    return for_indices + for_coordinates + for_blocks
+    """The number of random words that a randomization needs. In this order: one scrambles
+    the indices of the points; one for each coordinate scrambles it, and one for each shifts
+    it; and for `balanced_in_sixths`, one is the index of the first point, and one the place
+    of this point in its block."""
+    return 1 + 2 * dimension + 2
 
 
 def scrambled(
@@ -170,9 +139,8 @@ def scrambled(
     neighbours would have complementary coordinates in the same order everywhere, and errors
     that alternate along the sorted paths would add up.
     """
-    n, d = points.shape
-    indices = jnp.arange(n, dtype=jnp.uint32)
-    return _scrambled_points(points, indices, _Seeds.of(seeds, d))
+    indices = jnp.arange(len(points), dtype=jnp.uint32)
+    return _scrambled_points(points, indices, seeds)
 
 
 def balanced_in_sixths(
@@ -190,14 +158,14 @@ def balanced_in_sixths(
         return scrambled(points, seeds)
     # The first point and its place in its block are random. So each point has the same law,
     # and is the smallest of its block with probability 1/6.
-    parts = _Seeds.of(seeds, d)
-    place_in_block = parts.place_in_block % np.uint32(_BLOCK)
+    first_index, place = seeds[-2:]
+    place_in_block = place % np.uint32(_BLOCK)
     # `n` points are in at most `n // 6 + 2` blocks, wherever the first one begins.
     num_blocks = n // _BLOCK + 2
     places = jnp.arange(_BLOCK * num_blocks, dtype=jnp.uint32)
     # The points in turn, beginning again after the last (`n` is a power of two).
-    indices = (places + parts.first_index) & np.uint32(n - 1)
-    words = _scrambled_points(points, indices, parts)
+    indices = (places + first_index) & np.uint32(n - 1)
+    words = _scrambled_points(points, indices, seeds)
     blocks = words.reshape(num_blocks, _BLOCK)
     is_smallest = blocks == jnp.min(blocks, axis=1, keepdims=True)
     is_largest = blocks == jnp.max(blocks, axis=1, keepdims=True)
@@ -207,16 +175,18 @@ def balanced_in_sixths(
 
 
 def _scrambled_points(
-    points: UInt32[Array, "n d"], indices: UInt32[Array, " k"], seeds: _Seeds
+    points: UInt32[Array, "n d"],
+    indices: UInt32[Array, " k"],
+    seeds: UInt32[Array, " s"],
 ) -> UInt32[Array, "k d"]:
     """The points with these indices, with both the indices and the points scrambled."""
-    n, _ = points.shape
+    n, d = points.shape
     # Indices below `n`, a power of two, have `n.bit_length() - 1` of the 32 bits of a word.
     # They are scrambled as the leading bits.
     unused_bits = np.uint32(33 - n.bit_length())
-    leading = nested_scramble(indices << unused_bits, seeds.of_indices)
+    leading = nested_scramble(indices << unused_bits, seeds[0])
     scrambled_indices = leading >> unused_bits
     chosen_points = points[scrambled_indices.astype(jnp.int32)]
-    words = nested_scramble(chosen_points, seeds.of_coordinates)
+    words = nested_scramble(chosen_points, seeds[1 : d + 1])
     # The hash of one seed is not quite uniform; a digital shift makes it so.
-    return words ^ seeds.shifts
+    return words ^ seeds[d + 1 : 2 * d + 1]
