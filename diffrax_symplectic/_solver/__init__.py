@@ -26,10 +26,10 @@ from .beyond import StrangGauss, NinomiyaVictoir, PlateauGauss, LevyAreaMidpoint
 from .separable import SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet, PlateauVerlet
 from .additive import SRKs4, SRKw5, AdditiveGauss
 from .langevin import BAOAB, LangevinMiddle
-from .splitting import AbstractLangevinSplitting, Splitting
+from .splitting import AbstractLangevinSplitting, kicks_and_rest, Splitting
 from .pieces import AbstractPiece, Bath, Flight, Flow, Kick
 from .fast_flow import LinearFlow
-from .flow import is_solver, kicks_and_rest
+from .flow import is_solver
 from .linear_flow import linear_flow
 from .paths import common_path, own_path, path_of_array_cell
 from .root_finders import has_newton, with_changed_stages, without_newton

@@ -3,7 +3,6 @@
 from typing import Any
 
 import diffrax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
@@ -11,16 +10,11 @@ from jax import lax
 from jaxtyping import Array, Bool
 
 from .._arguments import check_pair
-from .._custom_types import Args, RealScalarLike, Terms, Y
-from .._terms import (
-    apply,
-    check_start,
-    split_terms,
-    Surface,
-    without_constraint,
-)
+from .._custom_types import Args, RealScalarLike, Y
+from .._terms import check_start, split_terms, Surface, without_constraint
 from .base import AbstractSymplecticSolver
-from .driven import drawn_variables, drift_change
+from .driven import drawn_variables
+from .pieces import Flight, Kick, lengths_and_times, Moving, Setting
 from .step import no_failure
 
 
@@ -43,6 +37,10 @@ def init_constrained(
     return R.where(is_dependent, R.singular, outcome)
 
 
+# Momenta and positions move as in the tableau of `StormerVerlet`.
+_VERLET = (Flight(1 / 2), Kick(1), Flight(1 / 2))
+
+
 def verlet_step(
     terms: diffrax.AbstractTerm,
     t0: RealScalarLike,
@@ -57,38 +55,28 @@ def verlet_step(
     this step. `solver_name` is for errors about the path."""
     surface = Surface.of(terms, t0, y0, args)
     drift, noise = split_terms(without_constraint(terms))
-    (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, y0)
-    half = (t1 - t0) / 2
-    # A path that failed before needs no multipliers: in a batch, others would wait for it.
-    pending = last_outcome == optx.RESULTS.successful
-
-    p, q, first_found = surface.free_flight(p, surface.normal_space(q), half, pending)
-    # The momentum is not tangent here. It need not be: forces do not depend on it, and the
-    # multipliers of the next flight make up for it.
-    y = (unravel_p(p), unravel_q(q))
-    force_kick, _ = drift_change(drift, t0, t1, args)(t0 + half, y)
-    p = p + jfu.ravel_pytree(force_kick)[0]
-    if len(noise) > 0:
-        p = p + _noise_change(noise, t0, t1, y, args, solver_name)
-    p, q, second_found = surface.free_flight(p, surface.normal_space(q), half, pending)
-    p = surface.tangent(p, surface.normal_space(q))
-    y1 = (unravel_p(p), unravel_q(q))
-    return end_and_outcome(y1, first_found & second_found, last_outcome)
-
-
-def _noise_change(
-    noise: Terms,
-    t0: RealScalarLike,
-    t1: RealScalarLike,
-    y: Y,
-    args: Args,
-    solver_name: str,
-) -> Array:
-    """The change of the momenta by the noise, as a vector. The vector fields are taken at
-    the middle of the step."""
-    variables = drawn_variables(noise, ["W"], t0, t1, solver_name)
-    change, _ = apply(noise, variables["W"], args, t0 + (t1 - t0) / 2, y)
-    return jfu.ravel_pytree(change)[0]
+    variables = {"W": []}
+    if noise:
+        variables = drawn_variables(noise, ["W"], t0, t1, solver_name)
+    length, time = lengths_and_times(t0, t1)
+    setting = Setting(
+        kicks=drift,
+        rest=drift,
+        friction=(),
+        noise=noise,
+        increments=[variables["W"]],
+        args=args,
+        length=length,
+        time=time,
+        surface=surface,
+        # A path that failed before needs no multipliers: in a batch, others would wait.
+        pending=last_outcome == optx.RESULTS.successful,
+    )
+    moving = Moving(y0, forces=None, flows={})
+    for number, piece in enumerate(_VERLET):
+        moving = piece.move(setting, moving, number)
+    moving = moving.made_tangent(surface)
+    return end_and_outcome(moving.y, moving.found, last_outcome)
 
 
 def end_and_outcome(

@@ -6,8 +6,7 @@ from typing import ClassVar
 import equinox as eqx
 
 from .._arguments import whole_number
-from .._tableau import Structure
-from .flow import check_flow, Flow as AnyFlow, is_solver
+from .flow import check_flow, Flow as AnyFlow
 from .pieces import AbstractPiece, Bath, Flight, Flow, Kick
 from .record import Record
 from .splitting import AbstractLangevinSplitting, check_has_no_bath
@@ -111,7 +110,7 @@ class BAOAB(AbstractLangevinSplitting):
     the ends of long steps are better.
     """
 
-    flow: AnyFlow = None
+    flow: AnyFlow | None = None
     steps: int = eqx.field(
         default=1, static=True, converter=ft.partial(whole_number, "steps")
     )
@@ -119,8 +118,14 @@ class BAOAB(AbstractLangevinSplitting):
     keeps_constraints: ClassVar[bool] = True
 
     def __check_init__(self):
-        check_flow(self.flow, self.steps, type(self).__name__)
-        check_has_no_bath(self.flow)
+        if self.flow is not None:
+            check_flow(self.flow, self.steps, type(self).__name__)
+            check_has_no_bath(self.flow)
+        elif self.steps > 1:
+            raise ValueError(
+                f"`steps={self.steps}` of `BAOAB` are those of a solver: pass one as "
+                "`flow`, such as `StormerVerlet()`."
+            )
 
     @property
     def pieces(self) -> tuple[AbstractPiece, ...]:  # pyright: ignore
@@ -138,10 +143,6 @@ class BAOAB(AbstractLangevinSplitting):
         choose = _CHOOSE_FOR_CONSTRAINTS if keeps_constraints else _CHOOSE_A_FLOW
         # Which stationary moments are exact depends on the flow, so none is promised.
         return _FREE_FLIGHT._replace(choose=choose, stationary=())
-
-    @property
-    def structure(self) -> Structure:
-        return self.flow.structure if is_solver(self.flow) else "separable"  # pyright: ignore
 
 
 class LangevinMiddle(AbstractLangevinSplitting):
@@ -181,7 +182,6 @@ class LangevinMiddle(AbstractLangevinSplitting):
     (2019)](https://doi.org/10.1021/acs.jpca.9b02771) for the splitting.
     """
 
-    structure: ClassVar[Structure] = "separable"
     pieces: ClassVar[tuple[AbstractPiece, ...]] = (
         Kick(1),
         _HALF_FLIGHT,

@@ -11,14 +11,23 @@ import jax
 import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
+from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
 from .._arguments import whole_number
+from .._compat import direction, ω
 from .._custom_types import Args, RealScalarLike, Terms, Y
 from .._terms import apply, NormalSpace, rate, Surface
 from .base import real_number
 from .bath import after_friction
-from .flow import after_flow, check_flow, Flow as AnyFlow, is_solver, moved
+from .flow import (
+    check_flow,
+    check_returns_pair,
+    Flow as AnyFlow,
+    is_solver,
+    returns_nan,
+)
+from .step import result_of
 
 
 if TYPE_CHECKING:
@@ -32,12 +41,12 @@ class Setting(NamedTuple):
 
     - `kicks`: the terms whose forces are the kicks.
     - `rest`: the terms that free flight or flows follow.
-    - `friction`, `noise`: the terms of the baths.
-    - `increments`: of each bath in turn, those of all noises.
+    - `friction`, `noise`: the terms of the baths. Without friction the noise acts in the
+        kick, of which there is one.
+    - `increments`: of each bath in turn, or of the kick, those of all noises.
     - `args`: as for `diffrax.diffeqsolve`.
-    - `lengths`, `times`: for shares `s` of the step, such as 0.5, the length `s h` of this
-        share and the time `t0 + s h` after it. Pieces with equal shares get the same array,
-        which is computed once.
+    - `length`, `time`: functions of a share `s` of the step, such as 0.5: the length `s h`
+        of this share, and the time `t0 + s h` after it.
     - `surface`: the surface of the constraint, if there is one.
     - `pending`: whether multipliers have to be found: not for a path that failed before.
     """
@@ -48,10 +57,30 @@ class Setting(NamedTuple):
     noise: Terms
     increments: list[list]
     args: Args
-    lengths: dict[float, RealScalarLike]
-    times: dict[float, RealScalarLike]
+    length: Callable[[float], RealScalarLike]
+    time: Callable[[float], RealScalarLike]
     surface: Surface | None = None
     pending: Bool[Array, ""] | None = None
+
+
+def lengths_and_times(
+    t0: RealScalarLike, t1: RealScalarLike
+) -> tuple[Callable[[float], RealScalarLike], Callable[[float], RealScalarLike]]:
+    """The functions `length` and `time` of a `Setting`, for a step from `t0` to `t1`. Equal
+    shares get the same array, which is computed once, and the end is exactly `t1`."""
+    h = t1 - t0
+
+    @ft.cache
+    def length(share: float) -> RealScalarLike:
+        return h if share == 1 else share * h
+
+    @ft.cache
+    def time(share: float) -> RealScalarLike:
+        if share == 1:
+            return t1
+        return t0 if share == 0 else t0 + length(share)
+
+    return length, time
 
 
 class Moving(NamedTuple):
@@ -59,6 +88,10 @@ class Moving(NamedTuple):
 
     - `y`: the momenta and positions.
     - `forces`: those of the kicks at `y`, if they are known.
+    - `flows`: by the number of its first piece, the state of each flow: of a solver its
+        state, of a function whether it returned NaN at the start.
+    - `results`: by the same numbers, the last result of each flow. It tells of all: after a
+        failure the state makes all further results failures, too.
     - `elapsed`: the share of the step for which positions have moved.
     - `num_baths`: how many baths have acted.
     - `normal_space`: with a constraint, the directions normal to it at `y`, if known.
@@ -68,6 +101,8 @@ class Moving(NamedTuple):
 
     y: Y
     forces: PyTree[Array] | None
+    flows: dict[int, PyTree[Array]]
+    results: dict[int, diffrax.RESULTS] = {}
     elapsed: float = 0.0
     num_baths: int = 0
     normal_space: NormalSpace | None = None
@@ -80,11 +115,16 @@ class Moving(NamedTuple):
         return self._replace(
             y=y,
             forces=None,
-            elapsed=_rounded(self.elapsed + share),
+            elapsed=self.elapsed_after(share),
             normal_space=None,
             is_tangent=False,
             **changes,
         )
+
+    def elapsed_after(self, share: float) -> float:
+        """`elapsed` after a further share. Rounding errors of the sum are removed, so that
+        equal times, such as those after 0.1 + 0.2 and 0.3 of a step, are computed once."""
+        return round(self.elapsed + share, 12)
 
     def with_normal_space(self, surface: Surface) -> "Moving":
         """The same state, with its normal space."""
@@ -103,10 +143,6 @@ class Moving(NamedTuple):
         return moving._replace(y=(unravel_p(p), self.y[1]), is_tangent=True)
 
 
-# The state after a piece; the state of its flow; and the result of its flow.
-_Moved = tuple[Moving, PyTree[Array], diffrax.RESULTS | None]
-
-
 class AbstractPiece(eqx.Module):
     """A piece of a [`diffrax_symplectic.Splitting`][]: for `share` of the step it moves
     momenta, positions, or both."""
@@ -115,11 +151,8 @@ class AbstractPiece(eqx.Module):
     moves_positions: AbstractClassVar[bool]
 
     @abc.abstractmethod
-    def move(
-        self, setting: Setting, moving: Moving, flow_state: PyTree[Array]
-    ) -> _Moved:
-        """The state after this piece. `flow_state` is the state of its flow, if it has
-        one."""
+    def move(self, setting: Setting, moving: Moving, number: int) -> Moving:
+        """The state after this piece. `number` is that of the first piece that is alike."""
 
 
 _share = ft.partial(real_number, "share")
@@ -138,18 +171,32 @@ class Kick(AbstractPiece):
     moves_positions: ClassVar[bool] = False
     share: float = eqx.field(static=True, converter=_share)
 
-    def move(self, setting, moving, flow_state):
-        if not setting.kicks:
-            return moving, None, None
+    def move(self, setting, moving, number):
         p, q = moving.y
         forces = moving.forces
-        if forces is None:
-            time = setting.times[moving.elapsed]
-            forces, _ = rate(setting.kicks, time, moving.y, setting.args)
-        p = moved(p, setting.lengths[self.share], forces)
+        if setting.kicks:
+            if forces is None:
+                time = setting.time(moving.elapsed)
+                forces, _ = rate(setting.kicks, time, moving.y, setting.args)
+            p = _moved(p, setting.length(self.share), forces)
+        if setting.noise and not setting.friction:
+            time = setting.time(moving.elapsed)
+            (increments,) = setting.increments
+            impulse, _ = apply(setting.noise, increments, setting.args, time, moving.y)
+            p = (p**ω + impulse**ω).ω
         # With a constraint the momenta need not be tangent before the next flight, whose
         # multipliers make up for it.
-        return moving._replace(y=(p, q), forces=forces, is_tangent=False), None, None
+        return moving._replace(y=(p, q), forces=forces, is_tangent=False)
+
+
+def _moved(x: PyTree, time: RealScalarLike, rate: PyTree) -> PyTree:
+    """`x` after `time` at a constant rate."""
+
+    def moved_leaf(x: Array, rate: Array) -> Array:
+        # The time is converted to the precision of the state, which it need not have.
+        return x + jnp.asarray(time, jnp.result_type(x)) * rate
+
+    return jtu.tree_map(moved_leaf, x, rate)
 
 
 class Flight(AbstractPiece):
@@ -164,33 +211,26 @@ class Flight(AbstractPiece):
     moves_positions: ClassVar[bool] = True
     share: float = eqx.field(static=True, converter=_share)
 
-    def move(self, setting, moving, flow_state):
+    def move(self, setting, moving, number):
+        length = setting.length(self.share)
         if setting.surface is not None:
-            return self._on_surface(setting, moving, setting.surface), None, None
+            moving = moving.with_normal_space(setting.surface)
+            (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, moving.y)
+            length = jnp.asarray(length, p.dtype)
+            p, q, found = setting.surface.free_flight(
+                p, moving.normal_space, length, setting.pending
+            )
+            y = (unravel_p(p), unravel_q(q))
+            return moving.after_move(y, self.share, found=moving.found & found)
         p, q = moving.y
         # Velocities do not depend on time, so any time will do. The start of the step for
         # the first flight, and its end for the last one, are times at which the kicks of
         # `BAOAB` evaluate forces: XLA then computes once what depends on time alone. Of the
         # rates only the velocities are used; XLA drops the forces.
-        time = setting.times[0.0]
-        if moving.elapsed > 0:
-            time = setting.times[_rounded(moving.elapsed + self.share)]
+        is_first = moving.elapsed == 0
+        time = setting.time(0.0 if is_first else moving.elapsed_after(self.share))
         _, velocities = rate(setting.rest, time, moving.y, setting.args)
-        q = moved(q, setting.lengths[self.share], velocities)
-        return moving.after_move((p, q), self.share), None, None
-
-    def _on_surface(self, setting: Setting, moving: Moving, surface: Surface) -> Moving:
-        normal_space = moving.with_normal_space(surface).normal_space
-        (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, moving.y)
-        length = jnp.asarray(setting.lengths[self.share], p.dtype)
-        p, q, found = surface.free_flight(
-            p,
-            normal_space,  # pyright: ignore
-            length,
-            setting.pending,  # pyright: ignore
-        )
-        y = (unravel_p(p), unravel_q(q))
-        return moving.after_move(y, self.share, found=moving.found & found)
+        return moving.after_move((p, _moved(q, length, velocities)), self.share)
 
 
 class Flow(AbstractPiece):
@@ -222,23 +262,69 @@ class Flow(AbstractPiece):
             return ()
         return self.steps * self.flow.stage_vectors(num_noises)  # pyright: ignore
 
-    def move(self, setting, moving, flow_state):
-        y, flow_state, result = after_flow(
-            self.flow,
-            self.steps,
-            setting.rest,
-            setting.times[moving.elapsed],
-            setting.times[_rounded(moving.elapsed + self.share)],
-            setting.lengths[self.share],
-            moving.y,
-            setting.args,
-            flow_state,
+    def check_follows(self, drift: Terms, t0, y0: Y, args: Args) -> None:
+        """Raises a `ValueError` if the flow does not take this drift or state."""
+        if is_solver(self.flow):
+            terms = diffrax.MultiTerm(*drift)
+            self.flow.check(terms, t0, y0, args)  # pyright: ignore
+        else:
+            check_returns_pair(self.flow, t0, y0, args)  # pyright: ignore
+
+    def begin(self, setting: Setting, t0, t1, y0: Y) -> PyTree[Array]:
+        """The state of the flow at the start of a solve, whose first step is from `t0` to
+        `t1`: of a solver its state, of a function whether it returns NaN."""
+        if is_solver(self.flow):
+            terms = diffrax.MultiTerm(*setting.rest)
+            return self.flow.init(terms, t0, t1, y0, setting.args)  # pyright: ignore
+        # Steps are positive even in a solve backward in time, where the flow runs back.
+        time = direction(setting.rest) * setting.length(self.share)
+        return returns_nan(self.flow, time, y0, setting.args)  # pyright: ignore
+
+    def move(self, setting, moving, number):
+        state = moving.flows[number]
+        if is_solver(self.flow):
+            y, state, result = self._after_steps(setting, moving, state)
+        else:
+            time = direction(setting.rest) * setting.length(self.share)
+            y = self.flow(time, moving.y, setting.args)  # pyright: ignore
+            R: Any = diffrax.RESULTS
+            result = R.where(state, R.nonfinite, result_of(None, y))
+        return moving.after_move(
+            y,
+            self.share,
+            flows=moving.flows | {number: state},
+            results=moving.results | {number: result},
         )
-        # With a constraint the step fails unless all is `found`, and otherwise by `result`.
-        found = moving.found
-        if setting.surface is not None:
-            found = found & (result == diffrax.RESULTS.successful)
-        return moving.after_move(y, self.share, found=found), flow_state, result
+
+    def _after_steps(
+        self, setting: Setting, moving: Moving, state: PyTree[Array]
+    ) -> tuple[Y, PyTree[Array], diffrax.RESULTS]:
+        """The state after all steps of a solver, the solver's state, and the result."""
+        solver: Any = self.flow
+        terms = diffrax.MultiTerm(*setting.rest)
+        t0 = setting.time(moving.elapsed)
+        t1 = setting.time(moving.elapsed_after(self.share))
+        h = (t1 - t0) / self.steps
+
+        def step(carry: tuple[Any, ...], index: Any) -> tuple[tuple[Any, ...], None]:
+            y, state, _ = carry
+            start = t0 + index * h
+            # What the bath did is a jump for a solver that remembers the end of its last
+            # step.
+            made_jump = True
+            y, _, _, state, result = solver.step(
+                terms, start, start + h, y, setting.args, state, made_jump
+            )
+            return (y, state, result), None
+
+        carry = moving.y, state, diffrax.RESULTS.successful
+        if self.steps == 1:
+            carry, _ = step(carry, 0)
+        else:
+            # The last result tells of all: after a failure the state of the solver, or a
+            # state that is not finite, makes all further steps fail.
+            carry, _ = lax.scan(step, carry, jnp.arange(self.steps))
+        return carry
 
 
 class Bath(AbstractPiece):
@@ -266,50 +352,42 @@ class Bath(AbstractPiece):
                 f"A `Bath` takes a positive share of the step; got {self.share:g}."
             )
 
-    def move(self, setting, moving, flow_state):
-        if setting.surface is not None:
-            moving = moving.made_tangent(setting.surface)
+    def move(self, setting, moving, number):
+        surface = setting.surface
+        if surface is not None:
+            moving = moving.made_tangent(surface).with_normal_space(surface)
         y = moving.y
         p, q = y
-        time = setting.times[moving.elapsed]
-        noise_impulse = None
-        if len(setting.noise) > 0:
+        time = setting.time(moving.elapsed)
+        length = setting.length(self.share)
+        impulse = jtu.tree_map(jnp.zeros_like, p)
+        if setting.noise:
             increments = setting.increments[moving.num_baths]
-            noise_impulse, _ = apply(setting.noise, increments, setting.args, time, y)
+            impulse, _ = apply(setting.noise, increments, setting.args, time, y)
 
-        def after_bath(impulse: PyTree[Array] | None) -> PyTree[Array]:
+        def after_bath(impulse: PyTree[Array]) -> PyTree[Array]:
             """The momenta after friction, and an impulse spread over the length of it."""
-            length = setting.lengths[self.share]
             return after_friction(
                 setting.friction, time, length, y, setting.args, impulse
             )
 
-        if setting.surface is None:
-            p = after_bath(noise_impulse)
+        if surface is None:
+            p = after_bath(impulse)
         else:
-            moving = moving.with_normal_space(setting.surface)
-            if noise_impulse is None:
-                noise_impulse = jtu.tree_map(jnp.zeros_like, p)
-            p = _tangent_after_bath(
-                setting.surface,
-                moving.normal_space,  # pyright: ignore
-                after_bath,
-                noise_impulse,
-            )
-        moving = moving._replace(y=(p, q), num_baths=moving.num_baths + 1)
-        return moving, None, None
+            p = _tangent_after_bath(surface, moving.normal_space, after_bath, impulse)
+        return moving._replace(y=(p, q), num_baths=moving.num_baths + 1)
 
 
 def _tangent_after_bath(
     surface: Surface,
-    normal_space: NormalSpace,
+    normal_space: NormalSpace | None,
     after_bath: Callable[[PyTree[Array]], PyTree[Array]],
-    noise_impulse: PyTree[Array],
+    impulse: PyTree[Array],
 ) -> PyTree[Array]:
     """The momenta after friction, noise and those constraint forces that make them tangent
     to the surface. `after_bath(impulse)` are the momenta after friction and an impulse, of
     noise or constraint forces. It is linear in the impulse, up to a constant."""
-    flat_noise_impulse, unravel = jfu.ravel_pytree(noise_impulse)
+    flat_impulse, unravel = jfu.ravel_pytree(impulse)
 
     def flat_after_bath(impulse: Array) -> Array:
         return jfu.ravel_pytree(after_bath(unravel(impulse)))[0]
@@ -319,64 +397,22 @@ def _tangent_after_bath(
     # tangent space, which keeps its Maxwell distribution.
     def response(normal: Array) -> Array:
         """The change of the momenta by a unit impulse along this normal."""
-        _, change_of_p = jax.jvp(flat_after_bath, (flat_noise_impulse,), (normal,))
+        _, change_of_p = jax.jvp(flat_after_bath, (flat_impulse,), (normal,))
         return change_of_p
 
-    p = flat_after_bath(flat_noise_impulse)
-    return unravel(surface.tangent(p, normal_space, response))
-
-
-def _rounded(elapsed: float) -> float:
-    """A sum of shares without its rounding errors, so that equal sums, such as 0.1 + 0.2
-    and 0.3, are one key of `Setting.lengths` and `Setting.times`."""
-    return round(elapsed, 12)
-
-
-def lengths_and_times(
-    pieces: tuple[AbstractPiece, ...], t0: RealScalarLike, t1: RealScalarLike
-) -> tuple[dict[float, RealScalarLike], dict[float, RealScalarLike]]:
-    """The `lengths` and `times` of a `Setting`, for a step from `t0` to `t1` of size `h`.
-
-    `lengths[s]` is `s h`, for the share of each piece and for each sum of shares;
-    `times[s]` is `t0 + s h` for each of these sums, and exactly `t1` at the end."""
-    h = t1 - t0
-    lengths: dict[float, Any] = {1.0: h}
-    times: dict[float, Any] = {0.0: t0, 1.0: t1}
-    elapsed = 0.0
-    for piece in pieces:
-        if piece.share not in lengths:
-            lengths[piece.share] = piece.share * h
-        if piece.moves_positions:
-            elapsed = _rounded(elapsed + piece.share)
-        if elapsed in times:
-            continue
-        if elapsed not in lengths:
-            lengths[elapsed] = elapsed * h
-        times[elapsed] = t0 + lengths[elapsed]
-    return lengths, times
+    p = flat_after_bath(flat_impulse)
+    return unravel(surface.tangent(p, normal_space, response))  # pyright: ignore
 
 
 def first_alike(pieces: tuple[AbstractPiece, ...]) -> tuple[int, ...]:
     """For each piece the number of the first piece that is alike, which is its own number
     if none before it is. Flows that are alike share one state, kept under this number."""
-    first_numbers = []
-    for piece in pieces:
-        alike = [_are_alike(piece, other) for other in pieces]
-        first_numbers.append(alike.index(True))
-    return tuple(first_numbers)
 
+    def are_alike(one: AbstractPiece, other: AbstractPiece) -> bool:
+        if isinstance(one, Flow) and isinstance(other, Flow):
+            same_flow = one.flow is other.flow and one.steps == other.steps
+        else:
+            same_flow = type(one) is type(other)
+        return same_flow and one.share == other.share
 
-def _are_alike(one: AbstractPiece, other: AbstractPiece) -> bool:
-    if type(one) is not type(other) or one.share != other.share:
-        return False
-    if isinstance(one, Flow) and isinstance(other, Flow):
-        return one.flow is other.flow and one.steps == other.steps
-    return True
-
-
-def are_kicks_at_both_ends(pieces: tuple[AbstractPiece, ...]) -> bool:
-    """Whether there is a kick before positions move, and one after they last did. Then the
-    forces of the last kick serve for the first kick of the next step, too."""
-    moves = [i for i, piece in enumerate(pieces) if piece.moves_positions]
-    kicks = [i for i, piece in enumerate(pieces) if isinstance(piece, Kick)]
-    return kicks[0] < moves[0] and kicks[-1] > moves[-1]
+    return tuple([are_alike(x, piece) for x in pieces].index(True) for piece in pieces)

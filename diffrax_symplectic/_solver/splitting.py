@@ -9,7 +9,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, PyTree
+from jax import lax
+from jaxtyping import Array, PyTree
 
 from .._arguments import check_state
 from .._compat import unwrapped, wrapped_like
@@ -20,6 +21,7 @@ from .._terms import (
     constraint_of,
     momentum_first,
     rate,
+    slow_apart,
     split_friction,
     Surface,
     with_constraint,
@@ -29,18 +31,9 @@ from .base import AbstractSymplecticSolver
 from .bath import check_friction
 from .constrained import end_and_outcome, init_constrained
 from .driven import drawn_variables
-from .flow import (
-    begin_flow,
-    check_follows,
-    check_keeps_constraint,
-    Flow as AnyFlow,
-    forces_at_start,
-    is_solver,
-    kicks_and_rest,
-)
+from .flow import Flow as AnyFlow, is_solver
 from .pieces import (
     AbstractPiece,
-    are_kicks_at_both_ends,
     Bath,
     first_alike,
     Flight,
@@ -65,14 +58,23 @@ class SplittingState(NamedTuple):
     """What a splitting hands on from the end of a step to the start of the next one.
 
     - `forces`: those of the kicks, if a step begins and ends with them.
-    - `flows`: for each piece the state of its flow: of a solver its state, of a function
-        whether it returned NaN at the start.
+    - `flows`: the states of the flows, as in `Moving`.
     - `outcome`: with a constraint, whether its multipliers were found in all steps so far.
     """
 
     forces: PyTree[Array]
-    flows: list[PyTree[Array]]
+    flows: dict[int, PyTree[Array]]
     outcome: optx.RESULTS | None
+
+
+def kicks_and_rest(has_flow: bool, drift: Terms) -> tuple[Terms, Terms]:
+    """The terms whose forces are the kicks of a splitting, and the terms that its flow
+    follows, or free flight."""
+    # Kicks take the forces of the whole drift, and free flight its velocities.
+    if not has_flow:
+        return drift, drift
+    rest, slow = slow_apart(drift)
+    return slow, rest
 
 
 class AbstractLangevinSplitting(AbstractSymplecticSolver):
@@ -102,9 +104,11 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
 
     @property
     def kicks_at_ends(self) -> bool:
-        """Whether a step kicks before positions move and after they did, so that it needs
-        forces at its end only."""
-        return are_kicks_at_both_ends(self.pieces)
+        """Whether a step kicks before positions move and after they last did. Then the
+        forces of its last kick serve for the first kick of the next step, too."""
+        moves = [i for i, piece in enumerate(self.pieces) if piece.moves_positions]
+        kicks = [i for i, piece in enumerate(self.pieces) if isinstance(piece, Kick)]
+        return kicks[0] < moves[0] and kicks[-1] > moves[-1]
 
     @property
     def _baths(self) -> list[Bath]:
@@ -113,34 +117,28 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
     @property
     def _flows(self) -> dict[int, Flow]:
         """The flows, each once, by the number of the first piece that is this flow."""
-        flows = {}
-        for number, piece in enumerate(self.pieces):
-            is_first = self._first_alike()[number] == number
-            if isinstance(piece, Flow) and is_first:
-                flows[number] = piece
-        return flows
+        return {
+            number: piece
+            for number, piece in enumerate(self.pieces)
+            if isinstance(piece, Flow) and self._first_alike()[number] == number
+        }
 
-    def area_factor(self, rate_times_step: ArrayLike) -> Any:
-        """The factor by which a step shrinks areas, where friction is one rate for all
-        momenta. At zero a step has no inverse."""
-        factor = 1.0
-        for bath in self._baths:
-            # Each bath is the midpoint rule for friction over its share of the step.
-            x = bath.share * rate_times_step / 2
-            factor = factor * (1 - x) / (1 + x)
-        return factor
+    @property
+    def structure(self) -> Structure:
+        for piece in self._flows.values():
+            if is_solver(piece.flow):
+                return piece.flow.structure  # pyright: ignore
+        return "separable"
 
     @property
     def friction_without_inverse(self) -> float:
-        """The smallest rate of friction times step for which `area_factor` is zero."""
+        """The smallest rate of friction times step for which a step shrinks areas to zero,
+        and has no inverse: one bath, the midpoint rule, does so."""
         return 2 / max(bath.share for bath in self._baths)
 
     def stage_vectors(self, num_noises):
-        vectors = ()
-        for piece in self.pieces:
-            if isinstance(piece, Flow):
-                vectors += piece.stage_vectors(num_noises)
-        return vectors
+        flows = [piece for piece in self.pieces if isinstance(piece, Flow)]
+        return tuple(size for flow in flows for size in flow.stage_vectors(num_noises))
 
     @property
     def undoes_its_steps(self) -> bool:
@@ -164,39 +162,39 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
             )
         check_friction(drift, friction, t0, y0, args, solver_name)
         for piece in self._flows.values():
-            check_follows(piece.flow, rest, t0, y0, args)
+            piece.check_follows(rest, t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args) -> Any:
         outcome = None
         if constraint_of(terms) is not None and self.keeps_constraints:
             for piece in self._flows.values():
-                check_keeps_constraint(piece.flow)
+                if not getattr(piece.flow, "keeps_constraints", False):
+                    raise ValueError(
+                        f"The flow {piece.flow!r} does not keep the constraint of the "
+                        "terms. Use `BAOAB()` or `BAOAB(StormerVerlet())`."
+                    )
             outcome = init_constrained(self, terms, t0, y0, args)
         else:
             self.check(terms, t0, y0, args)
         terms, y0 = momentum_first(terms, y0)
-        setting = self._setting(terms, t0, t1, y0, args, increments=[])
+        setting = self._setting(terms, t0, t1, y0, args)
         forces = None
         if self.kicks_at_ends and setting.kicks:
             forces, _ = rate(setting.kicks, t0, y0, args)
-        flows: list[PyTree] = [None for _ in self.pieces]
-        for number, piece in self._flows.items():
-            length = setting.lengths[piece.share]
-            flows[number] = begin_flow(
-                piece.flow, setting.rest, t0, t1, length, y0, args
-            )
+        flows = {
+            number: piece.begin(setting, t0, t1, y0)
+            for number, piece in self._flows.items()
+        }
         return SplittingState(forces, flows, outcome)
 
-    def _setting(self, terms, t0, t1, y0, args, increments) -> Setting:
-        """What the pieces of a step from `y0` have in common, for terms with the momentum
-        first."""
+    def _setting(self, terms, t0, t1, y0, args) -> Setting:
+        """What the pieces of a step from `y0` have in common, but for the increments, for
+        terms with the momentum first."""
         drift, friction, noise = split_friction(without_constraint(terms))
         kicks, rest = kicks_and_rest(self.has_flow, drift)
         constraint = constraint_of(terms)
-        lengths, times = lengths_and_times(self.pieces, t0, t1)
-        setting = Setting(
-            kicks, rest, friction, noise, increments, args, lengths, times
-        )
+        times = lengths_and_times(t0, t1)
+        setting = Setting(kicks, rest, friction, noise, [], args, *times)
         if constraint is None:
             return setting
         # A solver that is the flow gets only the terms in `rest`, so one of them has to
@@ -239,46 +237,42 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         own_terms = terms
         own_y0 = y0
         terms, y0 = momentum_first(own_terms, own_y0)
-        _, _, noise = split_friction(without_constraint(terms))
-        increments = self._increments(noise, t0, t1)
-        setting = self._setting(terms, t0, t1, y0, args, increments)
-        forces, flow_states, outcome = solver_state
-        flow_states = list(flow_states)
+        forces, flows, outcome = solver_state
+        setting = self._setting(terms, t0, t1, y0, args)
+        increments = self._increments(setting.noise, t0, t1)
+        setting = setting._replace(increments=increments)
         if setting.surface is not None:
             setting = setting._replace(pending=outcome == optx.RESULTS.successful)
+        # The forces at the end of the last step, unless the state jumped since then.
+        if forces is not None and made_jump is not False:
+            last_forces = forces
 
-        def compute_forces() -> PyTree[Array]:
-            forces, _ = rate(setting.kicks, t0, y0, args)
-            return forces
+            def compute_forces() -> PyTree[Array]:
+                forces, _ = rate(setting.kicks, t0, y0, args)
+                return forces
 
-        if forces is not None:
-            forces = forces_at_start(forces, made_jump, compute_forces)
-        moving = Moving(y0, forces)
-        flow_results = {}
+            forces = lax.cond(made_jump, compute_forces, lambda: last_forces)
+        moving = Moving(y0, forces, flows)
         for number, piece in zip(self._first_alike(), self.pieces):
-            moving, flow_state, result = piece.move(
-                setting, moving, flow_states[number]
-            )
-            flow_states[number] = flow_state
-            # Of pieces that share a flow state only the last result is kept: after a
-            # failure this state makes all further results failures, too.
-            if result is not None:
-                flow_results[number] = result
+            moving = piece.move(setting, moving, number)
         R: Any = diffrax.RESULTS
         if setting.surface is None:
-            result = result_of(None, moving.y)
-            for flow_result in flow_results.values():
-                result = R.where(flow_result == R.successful, result, flow_result)
             y1 = moving.y
+            result = result_of(None, y1)
+            for flow_result in moving.results.values():
+                result = R.where(flow_result == R.successful, result, flow_result)
         else:
+            found = moving.found
+            for flow_result in moving.results.values():
+                found = found & (flow_result == R.successful)
             moving = moving.made_tangent(setting.surface)
-            y1, outcome = end_and_outcome(moving.y, moving.found, outcome)
+            y1, outcome = end_and_outcome(moving.y, found, outcome)
             result = result_of(outcome, y1)
         result = result_with_times_checked(terms, t0, t1, result)
         # If the state is Diffrax's (x, v), its halves are exchanged once more.
         _, y1 = momentum_first(own_terms, y1)
         forces = moving.forces if self.kicks_at_ends else None
-        state = SplittingState(forces, flow_states, outcome)
+        state = SplittingState(forces, moving.flows, outcome)
         return y1, None, dict(y0=own_y0, y1=y1), state, result
 
 
@@ -345,13 +339,6 @@ class Splitting(AbstractLangevinSplitting):
 
     def _first_alike(self) -> tuple[int, ...]:
         return self.positions
-
-    @property
-    def structure(self) -> Structure:
-        for flow in self._flows.values():
-            if is_solver(flow.flow):
-                return flow.flow.structure  # pyright: ignore
-        return "separable"
 
     @property
     def record(self) -> Record:  # pyright: ignore

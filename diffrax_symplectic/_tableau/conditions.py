@@ -4,7 +4,6 @@ import dataclasses
 import functools as ft
 import itertools
 from collections.abc import Mapping
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -79,8 +78,8 @@ def weak_order_residuals(tableau: AbstractTableau, order: int) -> dict[str, floa
     """
     if order not in (1, 2):
         raise ValueError(f"`order` must be 1 or 2; got {order!r}.")
-    weak = _weak_conditions(tableau)
-    residuals = weak.first if order == 1 else weak.first | weak.second
+    first, second = _weak_conditions(tableau)
+    residuals = first if order == 1 else first | second
     return {formula: float(residual) for formula, residual in residuals.items()}
 
 
@@ -186,40 +185,30 @@ def _(tableau: PartitionedTableau) -> dict:
 def _(tableau: AdditiveTableau) -> dict:
     # The strong expansion has the terms of the weak one, and at order 3/2 the integrals
     # with the space-time area.
-    weak = _weak_conditions(tableau)
+    first, second = _weak_conditions(tableau)
     alpha = tableau.alpha
     c1 = tableau.c1
     # A tableau without the space-time area has zeros here, and fails its conditions.
     B_H = tableau.B.get("H", np.zeros((len(alpha), len(c1))))
     beta_H = tableau.beta.get("H", np.zeros(len(c1)))
     return {
-        **weak.first,
-        **weak.second,
+        **first,
+        **second,
         "alpha.B[H]e - 1": alpha @ B_H.sum(axis=1) - 1,
         "beta[W].c1 - 1/2": tableau.beta["W"] @ c1 - 1 / 2,
         "beta[H].c1 + 1": beta_H @ c1 + 1,
     }
 
 
-class _WeakConditions(NamedTuple):
-    """The residuals of the conditions for a weak order, by formula.
-
-    - `first`: the conditions for order 1.
-    - `second`: the additional conditions for order 2.
-    """
-
-    first: dict
-    second: dict
-
-
 @ft.singledispatch
-def _weak_conditions(tableau: AbstractTableau) -> _WeakConditions:
-    """The residuals of the conditions for the weak orders of the tableau's family."""
+def _weak_conditions(tableau: AbstractTableau) -> tuple[dict, dict]:
+    """The residuals of the conditions for the weak orders of the tableau's family, by
+    formula: those for order 1, and those that order 2 needs beside them."""
     raise _unknown_tableau(tableau)
 
 
 @_weak_conditions.register
-def _(tableau: GeneralTableau) -> _WeakConditions:
+def _(tableau: GeneralTableau) -> tuple[dict, dict]:
     """For one noise, and order 1 for any number."""
     _check_only_increment_drives_noise(tableau)
     # Short names, for formulas that can be compared with their keys.
@@ -258,11 +247,11 @@ def _(tableau: GeneralTableau) -> _WeakConditions:
         "beta.((A1e)(B1e)) - 1/4": be @ (A1e * B1e) - 1 / 4 - L,
         "beta.B1(A1e) - 1/4": be @ B1 @ A1e - 1 / 4 + L,
     }
-    return _WeakConditions(first, second)
+    return first, second
 
 
 @_weak_conditions.register
-def _(tableau: PartitionedTableau) -> _WeakConditions:
+def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
     """For random variables that are independent of each other."""
     be = tableau.beta["W"]
     A1 = tableau.A1
@@ -293,11 +282,11 @@ def _(tableau: PartitionedTableau) -> _WeakConditions:
         "(beta.e)(beta.A1e) - 1/2": be.sum() * (be @ A1.sum(axis=1)) - 1 / 2,
         "sum over variables: variance beta.A1(B0e)": sum_of_products,
     }
-    return _WeakConditions(first, second)
+    return first, second
 
 
 @_weak_conditions.register
-def _(tableau: SeparableTableau) -> _WeakConditions:
+def _(tableau: SeparableTableau) -> tuple[dict, dict]:
     """With conditions on the other random variables of the method's paper (Wang, Hong and
     Xu 2017, equations (3.3)-(3.5)), such as `(W^2 - h) / (2 sqrt(h))`: functions of `W`."""
     # A `PartitionedTableau` has sums over all variables, which assume that they are
@@ -305,16 +294,17 @@ def _(tableau: SeparableTableau) -> _WeakConditions:
     # zero, so the sums are taken over `W` alone, and for each of the others there are
     # conditions of its own: its weights times each of these moments vanish.
     only_W = {"W": tableau.B0["W"]}
-    weak = _weak_conditions(dataclasses.replace(tableau.partitioned(), B0=only_W))
+    partitioned = dataclasses.replace(tableau.partitioned(), B0=only_W)
+    first, second = _weak_conditions(partitioned)
     B0e = tableau.B0["W"].sum(axis=1)
     moments = {"A1e": tableau.A1.sum(axis=1), "A1(B0e)": tableau.A1 @ B0e}
     others = _conditions_on_other_variables(tableau.beta, moments)
     third_moment = {"beta.A1((B0e)^2)": tableau.beta["W"] @ tableau.A1 @ B0e**2}
-    return _WeakConditions(weak.first, weak.second | third_moment | others)
+    return first, second | third_moment | others
 
 
 @_weak_conditions.register
-def _(tableau: AdditiveTableau) -> _WeakConditions:
+def _(tableau: AdditiveTableau) -> tuple[dict, dict]:
     """For any number of noises, by sums over all independent random variables."""
     alpha = tableau.alpha
     Be = {name: B.sum(axis=1) for name, B in tableau.B.items()}
@@ -335,7 +325,7 @@ def _(tableau: AdditiveTableau) -> _WeakConditions:
     # The times at which constant noise is evaluated do not matter.
     if not tableau.constant:
         second["beta[W].c1 - 1/2"] = tableau.beta["W"] @ tableau.c1 - 1 / 2
-    return _WeakConditions(first, second)
+    return first, second
 
 
 def _check_only_increment_drives_noise(tableau: GeneralTableau) -> None:
@@ -368,22 +358,24 @@ def _conditions_on_other_variables(
     return residuals
 
 
+# Only variables with a law of their own have one.
+_VARIANCES = {
+    name: variable.variance
+    for name, variable in VARIABLES.items()
+    if variable.variance is not None
+}
+
+
 def _variance(name: str) -> float:
     """The variance of a random variable of a step, in units of the step's size."""
     # A tableau may have variables that are not known here, for a path of the user's own.
-    variable = VARIABLES.get(name)
-    if variable is None or variable.variance is None:
-        known = [
-            known_name
-            for known_name, known_variable in VARIABLES.items()
-            if known_variable.variance is not None
-        ]
+    if name not in _VARIANCES:
         raise ValueError(
-            f"The conditions are known for the random variables {', '.join(known)}; got a "
-            f"tableau with `{name}`. To measure the order of any solver use "
-            "`weak_order_defect`."
+            "The conditions are known for the random variables "
+            f"{', '.join(_VARIANCES)}; got a tableau with `{name}`. To measure the order "
+            "of any solver use `weak_order_defect`."
         )
-    return variable.variance
+    return _VARIANCES[name]
 
 
 def _unknown_tableau(tableau: AbstractTableau) -> ValueError:
@@ -415,8 +407,18 @@ def is_own_inverse(tableau: FlatTableau) -> bool:
     # are negated.
     if not channels <= _NEGATED_CHANNELS:
         return False
+
+    def may_be_partners(i: int, j: int) -> bool:
+        stage = tableau.stages[i]
+        other = tableau.stages[j]
+        # In a separable system, functions of p do not depend on time.
+        times_fit = stage.reads == "p" or np.isclose(other.c, 1 - stage.c)
+        has_same_weight = np.isclose(tableau.weights[i], tableau.weights[j])
+        return other.kind == stage.kind and bool(times_fit and has_same_weight)
+
     # Few stages have more than one partner, so that few pairings are tried.
-    partners = [_partners(tableau, i) for i in range(len(tableau.stages))]
+    numbers = range(len(tableau.stages))
+    partners = [[j for j in numbers if may_be_partners(i, j)] for i in numbers]
     for sigma in itertools.product(*partners):
         # The partner of the partner of a stage is the stage.
         is_pairing = all(sigma[j] == i for i, j in enumerate(sigma))
@@ -428,16 +430,3 @@ def is_own_inverse(tableau: FlatTableau) -> bool:
         if is_pairing and np.allclose(residuals, 0, atol=_ROUNDING):
             return True
     return False
-
-
-def _partners(tableau: FlatTableau, i: int) -> list[int]:
-    """The stages that may be paired with stage `i`, by their kinds, times and weights."""
-    stage = tableau.stages[i]
-    partners = []
-    for j, other in enumerate(tableau.stages):
-        # In a separable system, functions of p do not depend on time.
-        times_fit = stage.reads == "p" or np.isclose(other.c, 1 - stage.c)
-        has_same_weight = np.isclose(tableau.weights[i], tableau.weights[j])
-        if other.kind == stage.kind and times_fit and has_same_weight:
-            partners.append(j)
-    return partners

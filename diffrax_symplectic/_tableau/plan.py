@@ -132,7 +132,14 @@ def _with_equal_stages_merged(tableau: FlatTableau) -> FlatTableau:
 
     # Pairs are merged one at a time, since the merged stage may equal another.
     while pair := _first_pair(tableau, are_equal):
-        tableau = _with_coefficients_added(tableau, *pair)
+        i, j = pair
+        matrix = tableau.matrix.copy()
+        weights = tableau.weights.copy()
+        # A sum that should vanish may not in floating point: 0.1 + 0.2 - 0.3 is not 0.
+        matrix[:, i] = _snapped(matrix[:, i] + matrix[:, j])
+        weights[i] = _snapped(weights[i] + weights[j])
+        with_sums = dataclasses.replace(tableau, matrix=matrix, weights=weights)
+        tableau = _without(with_sums, j)
     return tableau
 
 
@@ -142,14 +149,20 @@ def _with_channels_merged(tableau: FlatTableau) -> FlatTableau:
     same coefficients: its value is the sum of both."""
 
     def can_be_summed(i: int, j: int) -> bool:
-        same_channels = tableau.stages[i].channels == tableau.stages[j].channels
-        if same_channels or not _same_evaluation(tableau, i, j):
-            return False
-        return _same_use(tableau, i, j)
+        return (
+            tableau.stages[i].channels != tableau.stages[j].channels
+            and _same_evaluation(tableau, i, j)
+            and _equal(tableau.matrix[:, i], tableau.matrix[:, j])
+            and _equal(tableau.weights[i], tableau.weights[j])
+        )
 
     # Pairs are merged one at a time, since the merged stage may be merged with another.
     while pair := _first_pair(tableau, can_be_summed):
-        tableau = _with_channels_joined(tableau, *pair)
+        i, j = pair
+        stages = list(tableau.stages)
+        channels = stages[i].channels + stages[j].channels
+        stages[i] = stages[i]._replace(channels=channels)
+        tableau = _without(dataclasses.replace(tableau, stages=tuple(stages)), j)
     return tableau
 
 
@@ -171,31 +184,6 @@ def _same_evaluation(tableau: FlatTableau, i: int, j: int) -> bool:
         and _equal(first.c, second.c)
         and _equal(tableau.matrix[i], tableau.matrix[j])
     )
-
-
-def _same_use(tableau: FlatTableau, i: int, j: int) -> bool:
-    """Whether the values of two stages enter everything with the same coefficients."""
-    in_stages = _equal(tableau.matrix[:, i], tableau.matrix[:, j])
-    return in_stages and _equal(tableau.weights[i], tableau.weights[j])
-
-
-def _with_coefficients_added(tableau: FlatTableau, i: int, j: int) -> FlatTableau:
-    """The tableau without stage `j`, whose coefficients are added to those of `i`."""
-    matrix = tableau.matrix.copy()
-    weights = tableau.weights.copy()
-    # A sum that should vanish may not in floating point: 0.1 + 0.2 - 0.3 is not 0.
-    matrix[:, i] = _snapped(matrix[:, i] + matrix[:, j])
-    weights[i] = _snapped(weights[i] + weights[j])
-    with_sums = dataclasses.replace(tableau, matrix=matrix, weights=weights)
-    return _without(with_sums, j)
-
-
-def _with_channels_joined(tableau: FlatTableau, i: int, j: int) -> FlatTableau:
-    """The tableau without stage `j`, whose channels drive stage `i` as well."""
-    channels = tableau.stages[i].channels + tableau.stages[j].channels
-    stages = list(tableau.stages)
-    stages[i] = stages[i]._replace(channels=channels)
-    return _without(dataclasses.replace(tableau, stages=tuple(stages)), j)
 
 
 def _without(tableau: FlatTableau, j: int) -> FlatTableau:
@@ -229,13 +217,13 @@ def _as_block(
     component: tuple[int, ...], depends: _Dependencies, tableau: FlatTableau
 ) -> Block:
     """The block of the stages `component`, which depend on each other."""
-    cut = _cut(component, depends)
-    unknown = _groups(cut.unknown, tableau)
+    numbers, rounds = _smallest_cut(component, depends)
+    unknown = _groups(numbers, tableau)
     if len(unknown) > 1:
         # Each group would unstack the values of the other groups again. Without stacking,
         # an iteration of five stages takes a third less time.
         unknown = tuple((i,) for group in unknown for i in group)
-    explicit = [group for ready in cut.rounds for group in _groups(ready, tableau)]
+    explicit = [group for ready in rounds for group in _groups(ready, tableau)]
     return Block(unknown, tuple(explicit))
 
 
@@ -248,28 +236,20 @@ def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
     return tuple(tuple(group) for group in groups.values())
 
 
-class _Cut(NamedTuple):
-    """A block with its dependency cycles broken.
-
-    - `unknown`: the stages whose removal breaks all cycles.
-    - `rounds`: the rounds in which the other stages can then be evaluated.
-    """
-
-    unknown: tuple[int, ...]
-    rounds: list[list[int]]
-
-
-def _cut(block: tuple[int, ...], depends: _Dependencies) -> _Cut:
-    """The smallest cut of a block. If there are too many choices, all stages are unknown:
-    these equations have the same solution, but more of them are solved."""
+def _smallest_cut(
+    block: tuple[int, ...], depends: _Dependencies
+) -> tuple[tuple[int, ...], list[list[int]]]:
+    """The fewest stages of a block whose removal breaks all cycles of dependencies, and the
+    rounds in which the others can then be evaluated. If there are too many choices, all
+    stages: these equations have the same solution, but more of them are solved."""
     for size in range(len(block)):
         if math.comb(len(block), size) > _MOST_CHOICES:
             break
         for unknown in itertools.combinations(block, size):
             rounds = _rounds([i for i in block if i not in unknown], depends)
             if rounds is not None:
-                return _Cut(unknown, rounds)
-    return _Cut(block, [])
+                return unknown, rounds
+    return block, []
 
 
 def _rounds(stages: Sequence[int], depends: _Dependencies) -> list[list[int]] | None:

@@ -13,6 +13,8 @@ from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float
 
+from .._brownian import VARIABLES
+
 
 # The Hamiltonians that coefficients apply to:
 # - "any";
@@ -23,11 +25,6 @@ from jaxtyping import Bool, Float
 Structure: TypeAlias = Literal[
     "any", "separable", "additive", "constant", "separable and constant"
 ]
-
-# The names of the random variables of a step. Their records, `VARIABLES` of `_brownian`,
-# hold Brownian paths, and thus JAX, of which this module knows nothing. A test compares the
-# names.
-NOISE_VARIABLES = ("W", "H", "C", "sign", "A", "L", "second", "third", "two_point")
 
 
 class Stage(NamedTuple):
@@ -84,21 +81,6 @@ class FlatTableau:
         )
 
 
-class AbstractTableau(abc.ABC):
-    """The base class of all tableaus.
-
-    - `structure`: the structure of the Hamiltonians that the coefficients apply to:
-        `"any"`, `"separable"`, `"additive"`, `"constant"` (additive and independent of
-        time) or `"separable and constant"`. Every solve checks it while tracing.
-    """
-
-    structure: ClassVar[Structure]
-
-    @abc.abstractmethod
-    def flatten(self) -> FlatTableau:
-        """All stages of the tableau, including unused ones, as one matrix."""
-
-
 # Anything that NumPy converts to an array; after the checks a read-only float64 array.
 Coefficients: TypeAlias = Any
 # A dictionary from names of random variables to coefficients, or coefficients for "W".
@@ -131,27 +113,51 @@ def _checked_coefficients(
     return array
 
 
-def _replace_by_checked(
-    tableau: AbstractTableau,
-    by_variable: tuple[str, ...] = (),
-    **shapes: tuple[int, ...],
-) -> None:
-    """Replaces coefficients of the tableau by checked, read-only arrays. `shapes` are their
-    shapes, by the names of the fields. A field in `by_variable` may hold a dictionary from
-    names of random variables to coefficients of this shape, and is replaced by one. Raises
-    a `ValueError` for wrong shapes, or numbers that are not real and finite."""
-    for name, shape in shapes.items():
-        value = getattr(tableau, name)
-        if name in by_variable:
-            arrays = value if isinstance(value, Mapping) else {"W": value}
-            checked = {
-                variable: _checked_coefficients(f"{name}[{variable!r}]", array, shape)
-                for variable, array in arrays.items()
-            }
-        else:
-            checked = _checked_coefficients(name, value, shape)
-        # A frozen dataclass refuses `tableau.name = checked`, in `__post_init__` too.
-        object.__setattr__(tableau, name, checked)
+class AbstractTableau(abc.ABC):
+    """The base class of all tableaus.
+
+    - `structure`: the structure of the Hamiltonians that the coefficients apply to:
+        `"any"`, `"separable"`, `"additive"`, `"constant"` (additive and independent of
+        time) or `"separable and constant"`. Every solve checks it while tracing.
+    """
+
+    structure: ClassVar[Structure]
+    # The axes of each field of coefficients: those named by the same letter are over the
+    # same stages.
+    _axes: ClassVar[dict[str, str]] = {}
+    # Fields that may hold a dictionary from names of random variables to coefficients.
+    _by_variable: ClassVar[tuple[str, ...]] = ()
+
+    def __post_init__(self):
+        """Replaces coefficients by checked, read-only arrays. Raises a `ValueError` for
+        wrong shapes, or numbers that are not real and finite."""
+        # Each kind of stages is counted in the first field that cannot be a dictionary and
+        # has its axis first.
+        num_stages = {}
+        for name, axes in self._axes.items():
+            if name not in self._by_variable:
+                value = getattr(self, name)
+                length = np.size(value) if len(axes) == 1 else len(value)
+                num_stages.setdefault(axes[0], length)
+        for name, axes in self._axes.items():
+            shape = tuple(num_stages[axis] for axis in axes)
+            value = getattr(self, name)
+            if name in self._by_variable:
+                arrays = value if isinstance(value, Mapping) else {"W": value}
+                checked = {
+                    variable: _checked_coefficients(
+                        f"{name}[{variable!r}]", array, shape
+                    )
+                    for variable, array in arrays.items()
+                }
+            else:
+                checked = _checked_coefficients(name, value, shape)
+            # A frozen dataclass refuses `self.name = checked`.
+            object.__setattr__(self, name, checked)
+
+    @abc.abstractmethod
+    def flatten(self) -> FlatTableau:
+        """All stages of the tableau, including unused ones, as one matrix."""
 
 
 def _variables(*coefficients: Mapping[str, np.ndarray]) -> list[str]:
@@ -209,6 +215,9 @@ class GeneralTableau(AbstractTableau):
     """
 
     structure: ClassVar[Structure] = "any"
+    _axes: ClassVar[dict[str, str]] = dict(
+        alpha="s", beta="r", A0="ss", B0="sr", A1="rs", B1="rr"
+    )
     alpha: Coefficients
     beta: Coefficients
     A0: Coefficients
@@ -225,25 +234,14 @@ class GeneralTableau(AbstractTableau):
                 '`noise` must hold the names of random variables, as in `("W",)`; got '
                 f"{self.noise!r}."
             )
-        unknown = [name for name in self.noise if name not in NOISE_VARIABLES]
+        unknown = [name for name in self.noise if name not in VARIABLES]
         if unknown:
             raise ValueError(
-                f"`noise` must hold names among {', '.join(map(repr, NOISE_VARIABLES))}; "
+                f"`noise` must hold names among {', '.join(map(repr, VARIABLES))}; "
                 f"got {', '.join(map(repr, unknown))}."
             )
         object.__setattr__(self, "noise", tuple(self.noise))
-        # Each stage has a weight, so the weights say how many stages there are.
-        drift_stages = np.size(self.alpha)
-        noise_stages = np.size(self.beta)
-        _replace_by_checked(
-            self,
-            alpha=(drift_stages,),
-            beta=(noise_stages,),
-            A0=(drift_stages, drift_stages),
-            B0=(drift_stages, noise_stages),
-            A1=(noise_stages, drift_stages),
-            B1=(noise_stages, noise_stages),
-        )
+        super().__post_init__()
 
     @classmethod
     def strong(cls, A, B, alpha, beta) -> "GeneralTableau":
@@ -297,25 +295,15 @@ class SeparableTableau(AbstractTableau):
     """
 
     structure: ClassVar[Structure] = "separable"
+    _axes: ClassVar[dict[str, str]] = dict(
+        alpha="s", beta="r", A0="ss", B0="sr", A1="rs"
+    )
+    _by_variable: ClassVar[tuple[str, ...]] = ("beta", "B0")
     alpha: Coefficients
     beta: CoefficientsByVariable
     A0: Coefficients
     B0: CoefficientsByVariable
     A1: Coefficients
-
-    def __post_init__(self):
-        drift_stages = np.size(self.alpha)
-        # `beta` may be a dictionary, so the number of noise stages is taken from `A1`.
-        noise_stages = len(self.A1)
-        _replace_by_checked(
-            self,
-            by_variable=("beta", "B0"),
-            alpha=(drift_stages,),
-            beta=(noise_stages,),
-            A0=(drift_stages, drift_stages),
-            B0=(drift_stages, noise_stages),
-            A1=(noise_stages, drift_stages),
-        )
 
     def partitioned(self) -> "PartitionedTableau":
         """The same method, with the coefficients of the velocities listed, too: here they
@@ -356,6 +344,10 @@ class PartitionedTableau(AbstractTableau):
     """
 
     structure: ClassVar[Structure] = "separable"
+    _axes: ClassVar[dict[str, str]] = dict(
+        alpha="s", alpha_hat="v", beta="r", A="vs", A_hat="sv", B0="vr", A1="rv"
+    )
+    _by_variable: ClassVar[tuple[str, ...]] = ("beta", "B0")
     alpha: Coefficients
     alpha_hat: Coefficients
     beta: CoefficientsByVariable
@@ -364,57 +356,36 @@ class PartitionedTableau(AbstractTableau):
     B0: CoefficientsByVariable
     A1: Coefficients
 
-    def __post_init__(self):
-        forces = np.size(self.alpha)
-        velocities = np.size(self.alpha_hat)
-        # `beta` may be a dictionary, so the number of noise stages is taken from `A1`.
-        noise_stages = len(self.A1)
-        _replace_by_checked(
-            self,
-            by_variable=("beta", "B0"),
-            alpha=(forces,),
-            alpha_hat=(velocities,),
-            beta=(noise_stages,),
-            A=(velocities, forces),
-            A_hat=(forces, velocities),
-            B0=(velocities, noise_stages),
-            A1=(noise_stages, velocities),
-        )
-
     def flatten(self) -> FlatTableau:
-        num_velocities = len(self.alpha_hat)
-        num_noise_stages = len(self.A1)
+        num_velocities, num_forces = self.A.shape
         variables = _variables(self.B0, self.beta)
-        B0 = _side_by_side(self.B0, variables, (num_velocities, num_noise_stages))
-        beta = _side_by_side(self.beta, variables, (num_noise_stages,))
-        # Each random variable has noise stages of its own, all at the same points: the
-        # velocities enter those of each variable in the same way.
-        A1 = np.concatenate([self.A1] * len(variables))
-        noise_times = self.A1.sum(axis=1)
+        shape = (num_velocities, len(self.A1))
+        B0 = _side_by_side(self.B0, variables, shape)
+        beta = _side_by_side(self.beta, variables, shape[1:])
         # Forces come first: a plan tries to take the first stages for its unknowns, and
         # forces cost more to evaluate than velocities.
-        force_stages = [
-            Stage(("h",), float(c_hat), "q", "p") for c_hat in self.A_hat.sum(axis=1)
-        ]
+        forces = [Stage(("h",), float(c), "q", "p") for c in self.A_hat.sum(axis=1)]
         # Velocities do not depend on time. All have the same time, so that a plan can merge
         # velocities at equal momenta.
-        velocity_stages = [Stage(("h",), 0.0, "p", "q") for _ in range(num_velocities)]
-        all_noise_stages = [
+        velocities = [Stage(("h",), 0.0, "p", "q")] * num_velocities
+        noise = [
             Stage((variable,), float(c1), "q", "p")
             for variable in variables
-            for c1 in noise_times
+            for c1 in self.A1.sum(axis=1)
         ]
-        stages = (*force_stages, *velocity_stages, *all_noise_stages)
-        # Where forces, velocities and noise stand among the stages. Momenta, at which
-        # velocities are evaluated, depend on forces and noise; positions on velocities.
+        # Momenta, at which velocities are evaluated, depend on forces and noise; positions
+        # on velocities.
+        stages = (*forces, *velocities, *noise)
         matrix = np.zeros((len(stages), len(stages)))
-        of_forces = slice(0, len(force_stages))
-        of_velocities = slice(of_forces.stop, of_forces.stop + num_velocities)
-        of_noise = slice(of_velocities.stop, len(stages))
+        of_forces = slice(0, num_forces)
+        of_velocities = slice(num_forces, num_forces + num_velocities)
+        of_noise = slice(num_forces + num_velocities, len(stages))
         matrix[of_forces, of_velocities] = self.A_hat
         matrix[of_velocities, of_forces] = self.A
         matrix[of_velocities, of_noise] = B0
-        matrix[of_noise, of_velocities] = A1
+        # Each random variable has noise stages of its own, all at the same points: the
+        # velocities enter those of each variable in the same way.
+        matrix[of_noise, of_velocities] = np.tile(self.A1, (len(variables), 1))
         return FlatTableau(
             stages=stages,
             matrix=matrix,
@@ -446,26 +417,14 @@ class AdditiveTableau(AbstractTableau):
     **Raises:** a `ValueError` for other shapes, or numbers that are not real and finite.
     """
 
+    _axes: ClassVar[dict[str, str]] = dict(alpha="s", beta="r", A="ss", B="sr", c1="r")
+    _by_variable: ClassVar[tuple[str, ...]] = ("beta", "B")
     alpha: Coefficients
     beta: CoefficientsByVariable
     A: Coefficients
     B: CoefficientsByVariable
     c1: Coefficients
     constant: bool = False
-
-    def __post_init__(self):
-        drift_stages = np.size(self.alpha)
-        # `beta` may be a dictionary, so the number of noise stages is taken from `c1`.
-        noise_stages = np.size(self.c1)
-        _replace_by_checked(
-            self,
-            by_variable=("beta", "B"),
-            alpha=(drift_stages,),
-            beta=(noise_stages,),
-            A=(drift_stages, drift_stages),
-            B=(drift_stages, noise_stages),
-            c1=(noise_stages,),
-        )
 
     @property
     def structure(self) -> Structure:

@@ -1,10 +1,7 @@
 """Coefficients satisfy their conditions, and only live, distinct stages are solved."""
 
-import ast
 import dataclasses
 import itertools
-import pathlib
-import re
 
 import diffrax
 import jax
@@ -13,9 +10,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._brownian import VARIABLES
 from diffrax_symplectic._tableau import Block, make_plan
-from diffrax_symplectic._tableau.tableau import NOISE_VARIABLES
 from examples._srkw2 import PaperSRKw2, srkw2_tableau
 
 from ..solver.test_every_solver import TABLE
@@ -194,10 +189,8 @@ def test_noise_of_a_tableau_is_a_tuple_of_names():
     for wrong in ("W", [0]):
         with pytest.raises(ValueError, match="`noise` must hold the names"):
             ds.GeneralTableau(**one, noise=wrong)
-    with pytest.raises(ValueError, match="names among 'W', .*; got 'bogus'."):
+    with pytest.raises(ValueError, match="names among .*'W'.*; got 'bogus'."):
         ds.GeneralTableau(**one, noise=("W", "bogus"))
-    # Tableaus know no JAX, so they have a list of their own.
-    assert set(NOISE_VARIABLES) == set(VARIABLES)
 
 
 def test_general_conditions_are_refused_unless_the_increment_drives_the_noise():
@@ -210,23 +203,3 @@ def test_general_conditions_are_refused_unless_the_increment_drives_the_noise():
         ):
             with pytest.raises(ValueError, match=r'variable "W", .*weak_order_defect'):
                 residuals(tableau)
-
-
-def test_tableaus_know_nothing_of_jax():
-    file = pathlib.Path(ds.__file__).parent / "_tableau" / "tableau.py"
-    imported = set()
-    for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.Import):
-            imported |= {alias.name for alias in node.names}
-        if isinstance(node, ast.ImportFrom):
-            imported.add("." * node.level + (node.module or ""))
-    outside = {name for name in imported if not re.match(r"\.[^.]", name)}
-    assert {"dataclasses", "numpy"} <= outside
-    assert outside <= {
-        "abc",
-        "collections.abc",
-        "dataclasses",
-        "jaxtyping",
-        "numpy",
-        "typing",
-    }
