@@ -53,8 +53,8 @@ def test_solutions_push_forward_to_the_equation_of_amplitudes():
             sides.append((1j * velocity, _by_conjugate(H, psi)))
         return sides
 
-    for velocity, slope in both_sides(_random(jr.key(0))):
-        np.testing.assert_allclose(velocity, slope, atol=1e-14)
+    for velocity, expected in both_sides(_random(jr.key(0))):
+        np.testing.assert_allclose(velocity, expected, atol=1e-14)
 
 
 def _by_conjugate(H, psi):
