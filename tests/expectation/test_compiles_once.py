@@ -12,6 +12,7 @@ from diffrax_symplectic._expectation.fitted.noise import Noise
 from diffrax_symplectic._simulation.problem import Problem
 
 from ..drjit_here import needs_drjit
+from ..picard import by_picard
 
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
@@ -97,9 +98,8 @@ def test_another_unit_of_truncation_compiles_nothing():
     y0 = jnp.array(0.0), jnp.array(1.0)
     for h in (0.125, 0.25):
         compiled.clear()
-        ds.ensemble(
-            terms, ds.ImplicitMidpoint(), 0, 4 * h, h, y0, key=jr.key(0), num_paths=8
-        )
+        given = terms, by_picard(ds.ImplicitMidpoint()), 0, 4 * h, h, y0
+        ds.ensemble(*given, key=jr.key(0), num_paths=8)
     assert compiled == []
 
 

@@ -144,18 +144,16 @@ def test_derivatives_are_those_of_the_solution():
         (p, q), _ = take_step(terms, 0.0, 0.1, y0, args)
         return jnp.sum(p["x"] ** 3) + jnp.sum(q["x"] ** 3)
 
-    x = jnp.array([1.3, 0.8, 0.3, 0.4, 0.6, 0.5])
-    slopes = jax.jit(jax.jacfwd(end))
-    moved = jnp.stack([x + s * 1e-5 * e for e in jnp.eye(6) for s in (1, -1)])
-    values = jax.jit(jax.vmap(end))(moved).reshape(6, 2)
-    exact = slopes(x)
-    np.testing.assert_allclose((values[:, 0] - values[:, 1]) / 2e-5, exact, atol=1e-8)
-    np.testing.assert_allclose(jax.jit(jax.grad(end))(x), exact, rtol=1e-11)
-    # Once more, along one direction.
-    along = lambda s: end(x + s * jnp.ones(6))
-    second = jax.jit(jax.jacfwd(jax.jacfwd(along)))(0.0)
-    near = [slopes(x + s) @ jnp.ones(6) for s in (1e-5, -1e-5)]
-    np.testing.assert_allclose((near[0] - near[1]) / 2e-5, second, rtol=1e-7)
+    x = np.array([1.3, 0.8, 0.3, 0.4, 0.6, 0.5])
+    both = jax.value_and_grad(end)
+    moved = np.stack([x + s * 1e-5 * e for e in np.eye(6) for s in (1, -1)])
+    values, gradients = map(np.asarray, jax.jit(jax.vmap(both))(moved))
+    forward, second = jax.jit(jax.jacfwd(both))(x)
+    differences = (values[::2] - values[1::2]) / 2e-5
+    np.testing.assert_allclose(differences, forward, atol=1e-8)
+    np.testing.assert_allclose((gradients[0] + gradients[1]) / 2, forward, rtol=1e-8)
+    differences = (gradients[::2] - gradients[1::2]) / 2e-5
+    np.testing.assert_allclose(differences, second, rtol=1e-7, atol=1e-8)
 
 
 def test_a_step_that_is_too_long_fails_alone():
@@ -219,11 +217,8 @@ def test_bad_starts_and_redundant_constraints_are_refused(terms, y0, advice):
 
 
 def test_bad_starts_fail_alone_in_a_batch():
-    solve = lambda y0: diffrax.diffeqsolve(
-        PENDULUM, ds.StormerVerlet(), 0, 1, 0.5, y0, throw=False
-    )
-    starts = jax.tree.map(lambda *x: jnp.stack(x), LEVEL, OFF)
-    okay = jax.jit(jax.vmap(solve))(starts).result == diffrax.RESULTS.successful
+    starts = jax.tree.map(lambda *x: np.stack(x), LEVEL, OFF)
+    _, okay = jax.jit(jax.vmap(lambda y0: take_steps(1, PENDULUM, 0.5, y0)))(starts)
     np.testing.assert_array_equal(okay, [True, False])
 
 
@@ -248,13 +243,15 @@ def test_a_state_is_projected_in_the_metric_of_the_masses():
     p1, q1 = ds.constrained_state(terms, (p, q), 0.5)
     assert np.max(np.abs(rods(q1, None))) <= 1e-15
     # Positions move along M^-1 J^T at the old ones, momenta along J^T at the new ones.
-    before, after = (jax.jacfwd(rods)(x, None).reshape(3, 6) for x in (q, q1))
-    moved = ((q1 - q) * MASSES).reshape(6)
+    p, q, p1, q1, masses = map(np.asarray, (p, q, p1, q1, MASSES))
+    slopes = jax.jit(jax.jacfwd(rods))
+    before, after = (np.reshape(slopes(x, None), (3, 6)) for x in (q, q1))
+    moved = ((q1 - q) * masses).reshape(6)
     change = (p1 - p).reshape(6)
     for normals, x in ((before, moved), (after, change)):
         rest = np.linalg.lstsq(normals.T, x)[1]
         assert rest <= 1e-28
-    np.testing.assert_allclose(after @ (p1 / MASSES).reshape(6), 0, atol=1e-14)
+    np.testing.assert_allclose(after @ (p1 / masses).reshape(6), 0, atol=1e-14)
     again = ds.constrained_state(terms, (p1, q1), 0.5)
     np.testing.assert_allclose(np.stack(again), np.stack((p1, q1)), atol=1e-15)
     single = jax.tree.map(jnp.float32, (p, q))

@@ -61,9 +61,10 @@ def test_a_bath_shares_its_key_with_no_other_term(make):
     suggest(make(path(0), path(1)))
 
 
-def moments(terms):
-    """The map of second moments by a step, exactly."""
-    return ds.second_moment_map(terms, ds.StormerVerlet(), 0.0, 0.25, ONE)
+def moments(*several):
+    """The map of second moments by a step with each of these terms, exactly."""
+    of = lambda terms: ds.second_moment_map(terms, ds.StormerVerlet(), 0.0, 0.25, ONE)
+    return jax.jit(lambda: [of(terms) for terms in several])()
 
 
 def test_other_terms_may_share_a_path_and_a_path_its_own_key():
@@ -73,7 +74,7 @@ def test_other_terms_may_share_a_path_and_a_path_its_own_key():
     twice = diffrax.MultiTerm(*one.terms, *ds.noise_terms(SPRING, path(0)).terms)
     double = lambda t, p, q, args: 2 * SPRING(t, p, q, args)
     expected = ds.hamiltonian_terms(WELL, double, path(0))
-    np.testing.assert_allclose(*map(moments, (twice, expected)), rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(*moments(twice, expected), rtol=1e-13, atol=1e-15)
 
 
 def doubled(first=WELL, second=WELL):
@@ -114,7 +115,7 @@ def test_two_paths_are_one_of_two_noises():
         *ds.hamiltonian_terms(WELL, SPRING, path(0)).terms,
         *ds.noise_terms(lambda t, p, q, args: 0.3 * q, path(1)).terms,
     )
-    np.testing.assert_allclose(*map(moments, (together, apart)), rtol=1e-13, atol=1e-15)
+    np.testing.assert_allclose(*moments(together, apart), rtol=1e-13, atol=1e-15)
 
 
 def test_of_several_traced_paths_it_is_not_known_whether_they_are_one():

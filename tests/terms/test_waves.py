@@ -8,14 +8,16 @@ import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
+import scipy.linalg
 
 import diffrax_symplectic as ds
 
+from ..picard import by_picard
 from ..problems import Given, slope, weak_path
 
 
-X = jnp.array([[0, 1], [1, 0]], complex)
-Z = jnp.array([[1, 0], [0, -1]], complex)
+X = np.array([[0, 1], [1, 0]], complex)
+Z = np.array([[1, 0], [0, -1]], complex)
 
 
 def _random(key, shape=(3,), dtype=jnp.complex128):
@@ -33,21 +35,33 @@ def _site_noise(t, psi, args):
 
 @pytest.mark.core
 def test_solutions_push_forward_to_the_equation_of_amplitudes():
-    psi, args, W = _random(jr.key(0)), 1.2 - 0.4j, jnp.array([0.3, -0.7])
+    args, W = 1.2 - 0.4j, jnp.array([0.3, -0.7])
     drift, diffusion = ds.wave_terms(_lattice, _site_noise, weak_path(2)).terms
-    y = ds.to_pair(psi)
-    for dy, H in (
-        (drift.vf(0.4, y, args), lambda psi: _lattice(0.4, psi, args)),
-        (
-            diffusion.vf_prod(0.4, y, args, W),
-            lambda psi: _site_noise(0.4, psi, args) @ W,
-        ),
-    ):
-        _, velocity = jax.jvp(ds.from_pair, (y,), (dy,))
-        # The derivative by psi*: half of the one by Re psi plus i times that by Im psi.
-        by_parts = jax.grad(lambda x, y: H(x + 1j * y), argnums=(0, 1))
-        dx, dy = by_parts(psi.real, psi.imag)
-        np.testing.assert_allclose(1j * velocity, (dx + 1j * dy) / 2, atol=1e-14)
+
+    @jax.jit
+    def both_sides(psi):
+        y = ds.to_pair(psi)
+        sides = []
+        for dy, H in (
+            (drift.vf(0.4, y, args), lambda psi: _lattice(0.4, psi, args)),
+            (
+                diffusion.vf_prod(0.4, y, args, W),
+                lambda psi: _site_noise(0.4, psi, args) @ W,
+            ),
+        ):
+            _, velocity = jax.jvp(ds.from_pair, (y,), (dy,))
+            sides.append((1j * velocity, _by_conjugate(H, psi)))
+        return sides
+
+    for velocity, expected in both_sides(_random(jr.key(0))):
+        np.testing.assert_allclose(velocity, expected, atol=1e-14)
+
+
+def _by_conjugate(H, psi):
+    """The derivative by psi*: half of the one by Re psi plus i times that by Im psi."""
+    by_parts = jax.grad(lambda x, y: H(x + 1j * y), argnums=(0, 1))
+    dx, dy = by_parts(psi.real, psi.imag)
+    return (dx + 1j * dy) / 2
 
 
 def test_amplitudes_of_pairs_give_them_back():
@@ -63,8 +77,9 @@ def test_amplitudes_of_pairs_give_them_back():
     same = lambda a, b: np.testing.assert_allclose(a, b, rtol=4 * jnp.finfo(dtype).eps)
     jax.tree.map(same, back, psi)
     assert all(x.dtype == dtype for x in jax.tree.leaves(back))
-    energy = jax.tree.map(lambda p, q: jnp.sum(p**2 + q**2) / 2, p, q)
-    jax.tree.map(lambda e, x: same(e, jnp.sum(jnp.abs(x) ** 2)), energy, psi)
+    p, q, psi = (jax.tree.map(np.asarray, x) for x in (p, q, psi))
+    energy = jax.tree.map(lambda p, q: np.sum(p**2 + q**2) / 2, p, q)
+    jax.tree.map(lambda e, x: same(e, np.sum(np.abs(x) ** 2)), energy, psi)
 
 
 def test_real_amplitudes_have_no_momentum():
@@ -83,7 +98,8 @@ def test_what_are_no_pairs_of_real_arrays_is_refused():
 
 # A noisy qubit: i dpsi = H psi dt + A psi o dw. The mean of psi psi^dagger follows
 # d rho / dt = -i [H, rho] - [A, [A, rho]] / 2.
-H, A = X / 2 + 0.3 * Z, 0.3 * (Z + X / 2)
+H = X / 2 + 0.3 * Z
+A = 0.3 * (Z + X / 2)
 QUBIT = np.array([np.sqrt(0.9), np.sqrt(0.1) * 1j])
 
 
@@ -102,32 +118,34 @@ def _lindblad(t):
     commutator = lambda M: np.kron(M, np.eye(2)) - np.kron(np.eye(2), M.T)
     L = -1j * commutator(H) - commutator(A) @ commutator(A) / 2
     rho = np.outer(QUBIT, np.conj(QUBIT)).ravel()
-    return (jax.scipy.linalg.expm(t * L) @ rho).reshape(2, 2)
+    return (scipy.linalg.expm(t * L) @ rho).reshape(2, 2)
 
 
-def _density(solver, t: float, steps: int):
-    """The density matrix by steps, without sampling: of the mean of p, q and their
+def _densities(solver, t: float, numbers):
+    """The density matrix by so many steps, without sampling: of the mean of p, q and their
     products."""
     y0 = ds.to_pair(jnp.asarray(QUBIT))
     terms = _qubit(ds.WeakBrownianPath((), jr.key(0)))
-    K = ds.second_moment_map(terms, solver, 0.0, t / steps, y0)
-    flat = jnp.concatenate([jnp.ones(1), *y0])
-    moments = jnp.linalg.matrix_power(K, steps) @ jnp.kron(flat, flat)
-    m = moments.reshape(5, 5)[1:, 1:]  # of p1, p2, q1, q2
-    pp, pq, qp, qq = m[:2, :2], m[:2, 2:], m[2:, :2], m[2:, 2:]
-    return (qq + pp + 1j * (pq - qp)) / 2
+    one_step = jax.jit(lambda h: ds.second_moment_map(terms, solver, 0.0, h, y0))
+    flat = np.concatenate([np.ones(1), *y0])
+    for steps in numbers:
+        K = np.asarray(one_step(t / steps))
+        moments = np.linalg.matrix_power(K, steps) @ np.kron(flat, flat)
+        m = moments.reshape(5, 5)[1:, 1:]  # of p1, p2, q1, q2
+        pp, pq, qp, qq = m[:2, :2], m[:2, 2:], m[2:, :2], m[2:, 2:]
+        yield (qq + pp + 1j * (pq - qp)) / 2
 
 
 @pytest.mark.parametrize(
     "solver, order",
-    [(ds.SRKw1(), 1), (ds.StrangGauss(), 2)],
+    [(by_picard(ds.SRKw1()), 1), (by_picard(ds.StrangGauss()), 2)],
     ids=["SRKw1", "StrangGauss"],
 )
 def test_noisy_qubit_has_the_density_matrix_of_lindblad_without_sampling(solver, order):
     steps = np.array([16, 32, 64])
-    found = jnp.stack([_density(solver, 2.0, int(n)) for n in steps])
-    np.testing.assert_allclose(jnp.trace(found, axis1=1, axis2=2), 1.0, rtol=1e-12)
-    errors = jnp.max(jnp.abs(found - _lindblad(2.0)), axis=(1, 2))
+    found = np.stack([*_densities(solver, 2.0, steps)])
+    np.testing.assert_allclose(np.trace(found, axis1=1, axis2=2), 1.0, rtol=1e-12)
+    errors = np.max(np.abs(found - _lindblad(2.0)), axis=(1, 2))
     assert abs(slope(1 / steps, errors) - order) <= 0.1
     assert errors[-1] <= (1e-2 if order == 1 else 1e-4)
 
@@ -144,7 +162,8 @@ def test_gradients_with_respect_to_complex_parameters_are_those_of_jax():
     @ft.partial(jax.value_and_grad, argnums=(0, 1))
     def both(z, psi0):
         at = terms, 0.0, 0.5, ds.to_pair(psi0), z, None, False
-        return jnp.abs(ds.from_pair(ds.ImplicitMidpoint().step(*at)[0])[0]) ** 2
+        y1, *_ = by_picard(ds.ImplicitMidpoint()).step(*at)
+        return jnp.abs(ds.from_pair(y1)[0]) ** 2
 
     z, k = 0.7 - 0.2j, 1e-6
     gradient, by_start = both(z, PSI0)[1]
@@ -160,12 +179,9 @@ def test_gradients_with_respect_to_complex_parameters_are_those_of_jax():
 def test_noises_of_waves_may_be_indexed():
     y = ds.to_pair(_random(jr.key(0)))
     indexed = ds.IndexedNoise(lambda k, t, psi, args: _site_noise(t, psi, args)[k], 2)
-    all_at_once, one_by_one = (
-        ds.wave_terms(_lattice, fields, weak_path(2)).terms[1].vf(0.4, y, 1.1)
-        for fields in (_site_noise, indexed)
-    )
-    for a, b in zip(one_by_one, all_at_once):
-        np.testing.assert_allclose(a, b, atol=1e-15)
+    both = [ds.wave_terms(_lattice, x, weak_path(2)) for x in (_site_noise, indexed)]
+    fields = jax.jit(lambda y: [terms.terms[1].vf(0.4, y, 1.1) for terms in both])(y)
+    np.testing.assert_allclose(*fields, atol=1e-15)
 
 
 def test_complex_states_are_told_of_wave_terms():
@@ -246,15 +262,21 @@ def _path(*shape):
 
 def test_solutions_push_forward_to_the_damped_equation_of_amplitudes():
     psi = _random(jr.key(0), (40, 3)) / 3
-    y = ds.to_pair(psi)
-    by_parts = jax.grad(lambda x, y: _phases(0.4, x + 1j * y, None), argnums=(0, 1))
-    dx, dy = by_parts(psi.real, psi.imag)
-    g = (dx + 1j * dy) / 2
-    dot = lambda a, b: jnp.sum(jnp.conj(a) * b, axis=-1, keepdims=True)
-    for damping in (jr.uniform(jr.key(1), (40,)), 0.3, 0.0):
-        terms = ds.wave_terms(_phases, _thermal, _path(40, 3), damping)
-        velocity = jax.jvp(ds.from_pair, (y,), (terms.terms[0].vf(0.4, y, None),))[1]
-        rate = jnp.reshape(jnp.broadcast_to(damping, 40), (40, 1))
+    dampings = jr.uniform(jr.key(1), (40,)), 0.3, 0.0
+
+    @jax.jit
+    def slope_and_velocities(psi):
+        y = ds.to_pair(psi)
+        push = lambda vf: jax.jvp(ds.from_pair, (y,), (vf,))[1]
+        terms = [ds.wave_terms(_phases, _thermal, _path(40, 3), x) for x in dampings]
+        velocities = [push(x.terms[0].vf(0.4, y, None)) for x in terms]
+        return _by_conjugate(lambda psi: _phases(0.4, psi, None), psi), velocities
+
+    g, velocities = jax.tree.map(np.asarray, slope_and_velocities(psi))
+    psi = np.asarray(psi)
+    dot = lambda a, b: np.sum(np.conj(a) * b, axis=-1, keepdims=True)
+    for damping, velocity in zip(dampings, velocities):
+        rate = np.reshape(np.broadcast_to(damping, 40), (40, 1))
         expected = -1j * g + rate * (psi * dot(g, psi) - g * dot(psi, psi))
         np.testing.assert_allclose(velocity, expected, atol=1e-13)
         # The damping changes no length, and takes energy from each vector.
@@ -267,10 +289,10 @@ def test_two_amplitudes_are_a_spin_with_twice_the_damping():
     H0 = lambda t, s, args: jnp.sum(s[..., 2] + 0.3 * s[..., 0] ** 2)
     as_waves = lambda t, psi, args: H0(t, ds.from_spinors(ds.to_pair(psi)), args)
     s = jr.normal(jr.key(0), (5, 3))
-    y = ds.to_spinors(s)
-    spin = ds.spin_terms(H0, damping=2 * ALPHA).terms[0].vf(0.0, y, None)
-    wave = ds.wave_terms(as_waves, damping=ALPHA).terms[0].vf(0.0, y, None)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-14), spin, wave)
+    both = ds.spin_terms(H0, damping=2 * ALPHA), ds.wave_terms(as_waves, damping=ALPHA)
+    field = lambda s, terms: terms.terms[0].vf(0.0, ds.to_spinors(s), None)
+    fields = jax.jit(lambda s: [field(s, terms) for terms in both])(s)
+    np.testing.assert_allclose(*fields, atol=1e-14)
 
 
 def test_density_of_gibbs_solves_the_equation_of_fokker_and_planck():
