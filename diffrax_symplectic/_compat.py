@@ -9,7 +9,6 @@ function here.
 
 import dataclasses
 import functools as ft
-import importlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -298,19 +297,6 @@ def is_literal(x: Any) -> bool:
     """Whether the value of an array of Dr.Jit is known while a kernel is recorded: it is a
     constant, or was computed from constants."""
     return x.state.name == "Literal"
-
-
-def variable_number(x: Any) -> int:
-    """The number that Dr.Jit has given to an array: the smallest that no other has. Each
-    operation that is recorded makes an array."""
-    return x.index
-
-
-def frozen_function(fn: Callable, most_recordings: int) -> Any:
-    """A function of arrays of Dr.Jit that is recorded once for each combination of types
-    and layouts of its arguments. Warns if that happens more often than this."""
-    drjit = importlib.import_module("drjit")
-    return drjit.freeze(fn, warn_after=most_recordings)
 
 
 class SolveState(NamedTuple):
