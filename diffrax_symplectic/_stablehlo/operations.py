@@ -22,11 +22,9 @@ def _itself(a):
 
 
 # For each function, the angle whose sine or cosine it takes, as a function of its operands.
-_ANGLES_OF_REAL: dict[str, Callable[..., Any]] = {
-    "cosine": _itself,
-    "sine": _itself,
-    "tan": _itself,
-}
+_ANGLES_OF_REAL: dict[str, Callable[..., Any]] = dict.fromkeys(
+    ("cosine", "sine", "tan"), _itself
+)
 _ANGLES_OF_COMPLEX: dict[str, Callable[..., Any]] = {
     "cosine": operator.attrgetter("real"),
     "exponential": operator.attrgetter("imag"),

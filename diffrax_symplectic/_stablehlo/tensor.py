@@ -50,16 +50,11 @@ class Table(Sequence):
         return len(self.addresses)
 
     def __getitem__(self, i: Any) -> Any:
-        if isinstance(i, slice):
-            return self.at_places(np.arange(len(self))[i])
         address = int(self.addresses[i])
         if self.values is not None:
             # A constant of the kernel, which costs no read of memory.
             return type(self.memory)(self.values[address].item())
         return self.gathered(array_types()["ui32"](address))
-
-    def at_places(self, places: np.ndarray) -> "Table":
-        return Table(self.memory, self.addresses[places], self.values)
 
     def gathered(self, addresses: Any) -> Any:
         """What is at these addresses in `memory`, one for each path."""
@@ -84,20 +79,16 @@ class Tensor:
         """The entries at these positions."""
         # Of a table, positions are moved, and nothing is read.
         if isinstance(self.entries, Table):
-            return Tensor(self.entries.at_places(places.ravel()), places.shape)
+            table = self.entries
+            addresses = table.addresses[places.ravel()]
+            moved = Table(table.memory, addresses, table.values)
+            return Tensor(moved, places.shape)
         return Tensor([self.entries[place] for place in places.flat], places.shape)
 
     def item(self) -> Any:
         """The entry of an array with a single one."""
         (entry,) = self.entries
         return entry
-
-
-def is_same_table(one: Sequence[Any], other: Sequence[Any]) -> bool:
-    """Whether both are the same part of the same array in memory."""
-    if not (isinstance(one, Table) and isinstance(other, Table)):
-        return False
-    return one.memory is other.memory and np.array_equal(one.addresses, other.addresses)
 
 
 def scalar(entry: Any) -> Tensor:

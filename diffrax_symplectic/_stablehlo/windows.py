@@ -112,13 +112,24 @@ def _window_of_table(
 ) -> Tensor:
     """As `_window_at`, where the entries of `x` are those of the `table` in memory. Each
     path reads its own window."""
-    # `x` may be a part of what is in memory, or its transpose.
+    # `x` may be a part of what is in memory, or its transpose: for each of its axes, the
+    # distance in memory between neighbours along it.
     addresses = table.addresses.reshape(x.shape)
-    strides = _strides(operation, addresses)
-    int32 = array_types()["i32"]
+    first = int(addresses.flat[0])
+    strides = [
+        int(addresses.take(1, axis).flat[0]) - first if size > 1 else 0
+        for axis, size in enumerate(x.shape)
+    ]
+    # Entries that were moved in another way than by slices and transposes have no strides.
+    if not np.array_equal(first + _offsets(strides, x.shape), addresses):
+        raise operation.refusal(
+            "with an index per path, from an array whose entries were moved other than by "
+            "slices and transposes"
+        )
     # The address of the window's first entry: that of the first entry of `x`, and a stride
     # for each index.
-    first_address = int32(int(addresses.flat[0]))
+    int32 = array_types()["i32"]
+    first_address = int32(first)
     for start, stride, length, size in zip(starts, strides, x.shape, sizes):
         index = _widened(start.item())
         dtype = type(index)
@@ -134,31 +145,9 @@ def _window_of_table(
     return Tensor(entries, tuple(sizes))
 
 
-def _strides(operation: Operation, addresses: np.ndarray) -> list[int]:
-    """For each axis of an array in memory, the distance between neighbours along it,
-    from the addresses of the entries. Raises a `NotReplayed` if distances differ along an
-    axis."""
-    first = int(addresses.flat[0])
-    strides = [
-        int(addresses.take(1, axis).flat[0]) - first if size > 1 else 0
-        for axis, size in enumerate(addresses.shape)
-    ]
-    # Entries that were moved in another way than by slices and transposes have no strides.
-    if not np.array_equal(first + _offsets(strides, addresses.shape), addresses):
-        raise operation.refusal(
-            "with an index per path, from an array whose entries were moved other than by "
-            "slices and transposes"
-        )
-    return strides
-
-
 def _offsets(strides: Sequence[int], shape: Sequence[int]) -> np.ndarray:
     """How far in memory each entry of an array of this shape is from the first."""
-    # `sparse` indices of an axis have length one along all others.
-    indices = np.indices(shape, sparse=True)
-    total = sum(stride * index for stride, index in zip(strides, indices))
-    # Without axes the sum is the number zero.
-    return np.broadcast_to(total, shape)
+    return np.tensordot(np.array(strides, int), np.indices(shape), axes=1)
 
 
 def _widened(index: Any) -> Any:
