@@ -30,7 +30,6 @@ from equinox.internal import (
 from jax.extend.core import (
     ClosedJaxpr as ClosedJaxpr,
     Jaxpr as Jaxpr,
-    jaxpr_as_fun,
     JaxprEqn,
     Literal as Literal,
 )
@@ -167,9 +166,8 @@ def with_captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[An
     result_treedef = jtu.tree_structure(struct)
 
     def call(value: PyTree, arrays: list[Any]) -> PyTree:
-        # A jaxpr is a function of its inputs and constants, both as flat lists.
-        run = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, arrays))
-        return result_treedef.unflatten(run(*jtu.tree_leaves(value)))
+        results = evaluated(traced.jaxpr, arrays, jtu.tree_leaves(value))
+        return result_treedef.unflatten(results)
 
     return call, traced.consts
 

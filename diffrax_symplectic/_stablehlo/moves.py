@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .backend import array_types, dr
-from .complex import equal, is_complex
+from .complex import equal
 from .integers import to_integer
 from .mlir import constant_values
 from .operation import Operation, rule
@@ -133,7 +133,9 @@ def _compare(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
     if direction not in ("eq", "ne"):
         return [map_entries(getattr(operator, direction), a, b)]
     # Complex numbers have no order, and are equal if both parts are.
-    is_equal = map_entries(equal if is_complex(a.entries[0]) else operator.eq, a, b)
+    is_equal = map_entries(
+        equal if dr.is_complex_v(a.entries[0]) else operator.eq, a, b
+    )
     # NaN differs from everything. In Dr.Jit NaN != NaN is false, unless it is folded.
     return [is_equal if direction == "eq" else map_entries(operator.invert, is_equal)]
 

@@ -25,7 +25,7 @@ from .operation import ONLY_REGION, Operation, rule
 from .tensor import (
     constant,
     entries_of,
-    known_values,
+    known_value,
     map_entries,
     scalar,
     Table,
@@ -43,11 +43,11 @@ def _possible_starts(start: Tensor, last: int, is_clipped: bool) -> dict[int, An
     the mask of the lanes whose window begins there. If it `is_clipped`, an index out of
     range counts as the nearest of these; otherwise its window begins nowhere."""
     every_lane = array_types()["i1"](True)
-    value = known_values(start)
+    value = known_value(start)
     if is_clipped and (value is not None or last == 0):
-        return {0 if value is None else int(np.clip(value, 0, last)): every_lane}
+        return {min(max(value or 0, 0), last): every_lane}
     if value is not None:
-        return {int(value): every_lane} if 0 <= value <= last else {}
+        return {value: every_lane} if 0 <= value <= last else {}
     index = _widened(start.item())
     masks = {begin: index == begin for begin in range(last + 1)}
     if is_clipped:
@@ -96,7 +96,7 @@ def _window_at(
 ) -> Tensor:
     """The window of `x` that begins at `starts`, moved into `x` if it is not within. Both
     `starts` and `sizes` have an element for each axis."""
-    is_known = all(known_values(start) is not None for start in starts)
+    is_known = all(known_value(start) is not None for start in starts)
     if isinstance(x.entries, Table) and not is_known:
         return _window_of_table(operation, x, x.entries, starts, sizes)
     windows = _possible_windows(operation, x, starts, sizes)
@@ -179,7 +179,7 @@ def _dynamic_update_slice(
 def _windows(
     x: Tensor,
     indices: Tensor,
-    vector_axis: int,
+    index_vector_dim: list[int],
     axes: Sequence[int],
     batched_axes: dict[int, int],
 ) -> tuple[tuple[int, ...], list[list[Tensor]]]:
@@ -187,11 +187,13 @@ def _windows(
     array of windows, and for each window, in row-major order, its start along each axis of
     `x`.
 
-    `indices` holds a vector for each window, along the axis `vector_axis`: the starts of
-    the window along each of `axes`. `batched_axes` maps axes of `x` to axes of `indices`:
-    along these, a window starts at its own position in the array of windows. Along all
-    other axes windows start at zero.
+    `indices` holds a vector for each window, along the axis `index_vector_dim`: the starts
+    of the window along each of `axes`. `batched_axes` maps axes of `x` to axes of
+    `indices`: along these, a window starts at its own position in the array of windows.
+    Along all other axes windows start at zero.
     """
+    # This number is printed only if it is not zero: an empty list has the sum zero.
+    vector_axis = sum(index_vector_dim)
     # If `indices` have no such axis, each vector is a single number.
     places = indices.places
     if vector_axis == places.ndim:
@@ -221,8 +223,7 @@ def _gather(operation: Operation, x: Tensor, indices: Tensor) -> list[Tensor]:
     shape, starts_of_windows = _windows(
         x,
         indices,
-        # This number is printed only if it is not zero: an empty list has the sum zero.
-        vector_axis=sum(part("index_vector_dim")),
+        index_vector_dim=part("index_vector_dim"),
         axes=part("start_index_map"),
         batched_axes=dict(zip(batched_axes, part("start_indices_batching_dims"))),
     )
@@ -249,8 +250,7 @@ def _scatter(
     shape, starts_of_windows = _windows(
         x,
         indices,
-        # As in `_gather`, an empty list stands for zero.
-        vector_axis=sum(part("index_vector_dim")),
+        index_vector_dim=part("index_vector_dim"),
         axes=part("scatter_dims_to_operand_dims"),
         batched_axes=dict(zip(batched_axes, part("scatter_indices_batching_dims"))),
     )
