@@ -9,7 +9,6 @@ function here.
 
 import dataclasses
 import functools as ft
-import importlib
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -31,7 +30,6 @@ from equinox.internal import (
 from jax.extend.core import (
     ClosedJaxpr as ClosedJaxpr,
     Jaxpr as Jaxpr,
-    jaxpr_as_fun,
     JaxprEqn,
     Literal as Literal,
 )
@@ -168,9 +166,8 @@ def with_captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[An
     result_treedef = jtu.tree_structure(struct)
 
     def call(value: PyTree, arrays: list[Any]) -> PyTree:
-        # A jaxpr is a function of its inputs and constants, both as flat lists.
-        run = jaxpr_as_fun(ClosedJaxpr(traced.jaxpr, arrays))
-        return result_treedef.unflatten(run(*jtu.tree_leaves(value)))
+        results = evaluated(traced.jaxpr, arrays, jtu.tree_leaves(value))
+        return result_treedef.unflatten(results)
 
     return call, traced.consts
 
@@ -298,19 +295,6 @@ def is_literal(x: Any) -> bool:
     """Whether the value of an array of Dr.Jit is known while a kernel is recorded: it is a
     constant, or was computed from constants."""
     return x.state.name == "Literal"
-
-
-def variable_number(x: Any) -> int:
-    """The number that Dr.Jit has given to an array: the smallest that no other has. Each
-    operation that is recorded makes an array."""
-    return x.index
-
-
-def frozen_function(fn: Callable, most_recordings: int) -> Any:
-    """A function of arrays of Dr.Jit that is recorded once for each combination of types
-    and layouts of its arguments. Warns if that happens more often than this."""
-    drjit = importlib.import_module("drjit")
-    return drjit.freeze(fn, warn_after=most_recordings)
 
 
 class SolveState(NamedTuple):

@@ -22,7 +22,6 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 from jax import lax
-from jaxtyping import Array, Bool
 
 from ._compat import (
     CALLS,
@@ -54,43 +53,43 @@ def lapack_in_turn(fn: Callable) -> Callable:
             return fn(*args)
         traced, dynamic, static = eqx.filter_make_jaxpr(fn)(*args)
         arrays = jtu.tree_leaves(eqx.filter(args, eqx.is_array))
-        outs = _SequentialLapack().run(traced, arrays)
+        outs = _run_in_turn(traced, arrays)
         treedef = jtu.tree_structure(dynamic)
         return eqx.combine(treedef.unflatten(outs), static)
 
     return call
 
 
-class _SequentialLapack:
-    """Evaluates programs, one after another, so that each call of LAPACK waits for the one
+def _run_in_turn(program: Jaxpr | ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
+    """The results of a program for these arguments. Each call of LAPACK waits for the one
     before."""
+    # The results of the last call so far.
+    results_before: Sequence[Any] = ()
 
-    def __init__(self):
-        # The results of the last call of LAPACK so far.
-        self._results_before: Sequence[Any] = ()
-
-    def run(self, program: Jaxpr | ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
-        """The results of a program for these arguments."""
-        return results_of_program(program, args, self._results_of_eqn)
-
-    def _results_of_eqn(self, eqn: Any, args: list[Any]) -> Sequence[Any]:
-        """The results of one operation. An operation that calls LAPACK waits for the last
-        one before that did."""
+    def results_of_eqn(eqn: Any, args: list[Any]) -> Sequence[Any]:
+        nonlocal results_before
         if not _calls_lapack(eqn):
             return results_of_operation(eqn, args, eqn.params)
         name = eqn.primitive.name
         if name in CALLS:
-            return self.run(eqn.params[CALLS[name]], args)
+            return results_of_program(eqn.params[CALLS[name]], args, results_of_eqn)
         if name == "custom_linear_solve":
-            solve, args_of_solve = _program_of_linear_solve(eqn, args)
-            return self.run(solve, args_of_solve)
+            # Its arguments are the constants of four functions, of which `solve` is the
+            # third, and the right-hand side.
+            lengths = eqn.params["const_lengths"]
+            begin = lengths.matvec + lengths.vecmat
+            constants = args[begin : begin + lengths.solve]
+            args = [*constants, *args[sum(lengths) :]]
+            return results_of_program(eqn.params["jaxprs"].solve, args, results_of_eqn)
         # A loop as a whole waits for the call before, and the next call for the loop.
-        args_in_turn = _with_dependence(args, self._results_before)
         params = eqn.params
         if name in _CONTROL_FLOW:
-            params = _with_turns_inside(params)
-        self._results_before = results_of_operation(eqn, args_in_turn, params)
-        return self._results_before
+            params = jtu.tree_map(_with_turns_inside, params, is_leaf=is_program)
+        args = _with_dependence(args, results_before)
+        results_before = results_of_operation(eqn, args, params)
+        return results_before
+
+    return results_of_program(program, args, results_of_eqn)
 
 
 def _calls_lapack(eqn: Any) -> bool:
@@ -114,7 +113,9 @@ def _with_dependence(args: list[Any], results_before: Sequence[Any]) -> list[Any
     for x in results_before:
         if _has_numbers(x):
             never = never & (jnp.ravel(x)[0] != 0)
-    return [_zeros_if(never, x) if _has_numbers(x) else x for x in args]
+    return [
+        jnp.where(never, jnp.zeros_like(x), x) if _has_numbers(x) else x for x in args
+    ]
 
 
 def _has_numbers(x: Any) -> bool:
@@ -123,35 +124,12 @@ def _has_numbers(x: Any) -> bool:
     return jnp.size(x) > 0 and not is_extended
 
 
-def _zeros_if(condition: Bool[Array, ""], x: Any) -> Array:
-    return jnp.where(condition, jnp.zeros_like(x), x)
-
-
-def _program_of_linear_solve(
-    eqn: Any, args: list[Any]
-) -> tuple[ClosedJaxpr, list[Any]]:
-    """The program that `lax.custom_linear_solve` calls, and its arguments."""
-    # The arguments of the operation are the constants of four functions, of which `solve`
-    # is the third, and the right-hand side.
-    lengths = eqn.params["const_lengths"]
-    begin = lengths.matvec + lengths.vecmat
-    constants_of_solve = args[begin : begin + lengths.solve]
-    rhs = args[sum(lengths) :]
-    return eqn.params["jaxprs"].solve, [*constants_of_solve, *rhs]
-
-
-def _with_turns_inside(params: dict[str, Any]) -> dict[str, Any]:
-    """The parameters of an operation. In all programs among them, each call of LAPACK waits
-    for the one before."""
-
-    def program_with_turns(param: Any) -> Any:
-        if not isinstance(param, ClosedJaxpr):
-            return param
-        structs = [variable.aval for variable in param.jaxpr.invars]
-        # The calls of the program wait for each other only: the operation as a whole waits
-        # for those before.
-        return jax.make_jaxpr(lambda *args: _SequentialLapack().run(param, args))(
-            *structs
-        )
-
-    return jtu.tree_map(program_with_turns, params, is_leaf=is_program)
+def _with_turns_inside(param: Any) -> Any:
+    """A parameter of an operation. If it is a program, each call of LAPACK in it waits for
+    the one before."""
+    if not isinstance(param, ClosedJaxpr):
+        return param
+    structs = [variable.aval for variable in param.jaxpr.invars]
+    # The calls of the program wait for each other only: the operation as a whole waits for
+    # those before.
+    return jax.make_jaxpr(lambda *args: _run_in_turn(param, args))(*structs)

@@ -13,7 +13,6 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
-from .._compat import frozen_function, variable_number
 from .._custom_types import RealScalarLike
 from .._stablehlo import array_in_memory, array_types, dr, entries_of, scalar
 from .path_functions import PathFunctions
@@ -100,8 +99,10 @@ class Kernels:
         types_of_key = self._path_keys.types["key"]
         self._types_for_keys = dict(arrays=types["arrays"], key=types_of_key)
         self._compiled_solver_state = jax.jit(self._solver_state_at_start)
-        self._make_keys = frozen_function(self._record_keys, _MOST_RECORDINGS)
-        self._take_steps = frozen_function(self._record_steps, _MOST_RECORDINGS)
+        # They are recorded once for each combination of types and layouts of arguments.
+        frozen = ft.partial(dr.freeze, warn_after=_MOST_RECORDINGS)
+        self._make_keys = frozen(self._record_keys)
+        self._take_steps = frozen(self._record_steps)
 
     def _solver_state_at_start(
         self, arrays: list[Array], key, y: list[Array], own_args: list[Array]
@@ -209,7 +210,7 @@ class Kernels:
         is in memory as arguments, and so for the large `constants` of a step."""
         # Dr.Jit numbers its variables one after another, one for each operation. So the
         # difference between this number and the last one below counts the operations.
-        first_variable = variable_number(first_step + 1)
+        first_variable = (first_step + 1).index
         types = self._step.types
         shared = unpack(self._types_of_shared, packed)
         same_in_all_steps = dict(
@@ -255,7 +256,7 @@ class Kernels:
         _, stopped, y, solver_state = dr.while_loop(
             state_at_start, has_more_steps, after_step, mode="symbolic"
         )
-        last_variable = max(map(variable_number, [stopped, *y, *solver_state]))
+        last_variable = max(x.index for x in [stopped, *y, *solver_state])
         num_operations = last_variable - first_variable
         if num_operations > _MOST_OPERATIONS:
             # Before the kernel is compiled.

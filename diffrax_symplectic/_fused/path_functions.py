@@ -44,7 +44,7 @@ class PathFunctions(NamedTuple):
         structure with `None` for all other leaves.
     - `static`, `static_treedef`: the other leaves, such as the user's functions, which are
         part of what is compiled, and the structure with `None` for arrays.
-    - `impl`: the implementation of random keys.
+    - `key`: the shape and type of a random key.
     - `own_args`: the shapes of the arrays of `args` that each path has of its own.
     - `paths_differ`: whether each path has its own initial state and `args`.
     - `settings`: settings of JAX that programs depend on.
@@ -54,18 +54,13 @@ class PathFunctions(NamedTuple):
     arrays_treedef: Any
     static: tuple[Any, ...]
     static_treedef: Any
-    impl: str
+    key: jax.ShapeDtypeStruct
     own_args: tuple[jax.ShapeDtypeStruct, ...]
     paths_differ: bool
     settings: tuple[Any, ...]
 
     # The programs of a kernel are traced from the methods below. All that they read is a
     # field above or an argument, so that equal `PathFunctions` have equal programs.
-
-    @property
-    def key(self) -> Any:
-        """The shape and type of a random key."""
-        return jax.eval_shape(lambda: jr.key(0, impl=self.impl))
 
     def system(self, arrays: Sequence[Any]) -> PyTree:
         """The system with these arrays."""
@@ -165,7 +160,7 @@ def functions_and_arrays(
         arrays_treedef=arrays_treedef,
         static=tuple(static_leaves),
         static_treedef=static_treedef,
-        impl=str(jr.key_impl(key)),
+        key=_struct(key),
         own_args=tuple(map(_struct, jtu.tree_leaves(own_args))),
         paths_differ=paths_differ,
         # The type of Python's floats says whether JAX has 64 bits.

@@ -6,7 +6,6 @@ are rare since they cost much. In a kernel each path ends by itself, and checks 
 sweep.
 """
 
-import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -42,85 +41,6 @@ _DIVERGED = 1e30
 _LARGEST_RATE = 4
 
 
-class _Equations(NamedTuple):
-    r"""The equations $y = \Phi(y)$ of a step, in two halves.
-
-    - `image`: the map $\Phi$.
-    - `in_halves`: whether the unknowns are `Halves`. Otherwise the equations are doubled,
-        to $y = \Phi(z)$, $z = \Phi(y)$, with the halves $y$ and $z$. They are solved when
-        $y = z$: a cycle of period two fulfils them, too, with $y \neq z$.
-    """
-
-    image: Callable[[PyTree[Array]], PyTree[Array]]
-    in_halves: bool
-
-    def start(self, guess: PyTree[Array]) -> Halves:
-        """The iterate before the first sweep."""
-        return guess if self.in_halves else Halves(guess, guess)
-
-    def sweep(self, y: Halves, relaxation: Scalar | None = None) -> Halves:
-        """The iterate after a sweep, in which $q$ reads the new $p$. Without a `relaxation`
-        this takes fewer operations than with a relaxation of one."""
-        unrelaxed_p = self.image(y).p if self.in_halves else self.image(y.q)
-        with_new_p = Halves(_relaxed(unrelaxed_p, y.p, relaxation), y.q)
-        unrelaxed_q = (
-            self.image(with_new_p).q if self.in_halves else self.image(with_new_p.p)
-        )
-        return Halves(with_new_p.p, _relaxed(unrelaxed_q, y.q, relaxation))
-
-    def value(self, y: Halves) -> PyTree[Array]:
-        """The unknowns of an iterate."""
-        return y if self.in_halves else y.q
-
-    def solution(self, y: Halves) -> PyTree[Array]:
-        """The unknowns after the last sweep."""
-        # The halves differ by the last correction, which may be larger than the tolerance:
-        # convergence is decided by the next one. With the new half of another sweep, paths
-        # of a field with jumps were off by 0.7 units in the last place, and without by 49.
-        return y if self.in_halves else self.image(y.q)
-
-    def correction(self, old: Halves, new: Halves) -> PyTree[Array]:
-        """The change of the unknowns by the last sweep, from `old` to `new`; for doubled
-        equations the difference of the two halves, since only equal halves are a
-        solution."""
-        return (new**ω - old**ω).ω if self.in_halves else (new.q**ω - new.p**ω).ω
-
-
-def _relaxed(new: PyTree, old: PyTree, relaxation: Scalar | None) -> PyTree[Array]:
-    if relaxation is None:
-        return new
-    return (old**ω + relaxation * (new**ω - old**ω)).ω
-
-
-class _Criterion(NamedTuple):
-    """What decides whether a correction is small enough.
-
-    - `weights`: for each leaf, the inverse of its tolerance, up to a factor of two.
-    - `rounding`: the largest correction that may be a rounding error.
-    """
-
-    weights: list[Scalar]
-    rounding: Scalar
-
-    def measure(
-        self, correction: PyTree[Array], size_before: Scalar
-    ) -> tuple[Scalar, Bool[Array, ""]]:
-        """The size of a correction that follows one of size `size_before`, in units of the
-        tolerance, and whether sweeps have converged."""
-        sizes = _sizes(correction)
-        size = _largest([x * weight for x, weight in zip(sizes, self.weights)])
-        # The next correction is expected to be `size * ratio` with the last ratio, `size /
-        # size_before`. If corrections grow, the ratio says nothing, and counts as one. So
-        # the condition is `2^LOG2_MARGIN * size * min(ratio, 1) <= 1`, and here both sides
-        # are multiplied by `size_before`, since a division takes long.
-        ratio_times_size_before = jnp.where(size < size_before, size, size_before)
-        is_next_small = 2.0**LOG2_MARGIN * size * ratio_times_size_before <= size_before
-        # Rounding errors do not shrink any further.
-        is_stalled = size >= 2.0**LOG2_STALLED * size_before
-        is_rounding = _largest(sizes) <= self.rounding
-        return size, is_next_small | (is_stalled & is_rounding)
-
-
 class _SweepState(NamedTuple):
     """The state of the loop over sweeps.
 
@@ -144,22 +64,64 @@ def solve_one_path(
 
     `scale` maps an iterate to the sizes to which errors are relative. The arguments are
     those that [`diffrax_symplectic.PicardNewton`][] is called with.
-    """
-    equations = _Equations(image, isinstance(guess, Halves))
-    dtype = jnp.result_type(*jtu.tree_leaves(guess))
-    # Three sweeps come before the loop: they make two corrections, whose ratio is the rate
-    # of convergence.
-    first = equations.sweep(equations.start(guess))
-    # The tolerance is taken once, at the first iterate.
-    criterion = _criterion(scale(equations.value(first)), dtype)
-    second = equations.sweep(first)
-    third = equations.sweep(second)
-    one = jnp.ones((), dtype)
-    # Of the first correction only the size is needed: there is none before to compare with.
-    size_before, _ = criterion.measure(equations.correction(first, second), one)
-    last_correction = equations.correction(second, third)
-    size, is_solved = criterion.measure(last_correction, size_before)
 
+    Unless the unknowns are `Halves`, the equations are doubled, to $y = \Phi(z)$, $z =
+    \Phi(y)$, with the halves $y$ and $z$. They are solved when $y = z$: a cycle of period
+    two fulfils them, too, with $y \neq z$.
+    """
+    in_halves = isinstance(guess, Halves)
+    dtype = jnp.result_type(*jtu.tree_leaves(guess))
+    eps = jnp.finfo(dtype).eps
+    one = jnp.ones((), dtype)
+
+    def relaxed(new: PyTree, old: PyTree, relaxation: Scalar | None) -> PyTree[Array]:
+        if relaxation is None:
+            return new
+        return (old**ω + relaxation * (new**ω - old**ω)).ω
+
+    # In a sweep $q$ reads the new $p$. Without a `relaxation` it takes fewer operations
+    # than with a relaxation of one.
+    def sweep(y: Halves, relaxation: Scalar | None = None) -> Halves:
+        unrelaxed_p = image(y).p if in_halves else image(y.q)
+        y = Halves(relaxed(unrelaxed_p, y.p, relaxation), y.q)
+        unrelaxed_q = image(y).q if in_halves else image(y.p)
+        return Halves(y.p, relaxed(unrelaxed_q, y.q, relaxation))
+
+    first = sweep(guess if in_halves else Halves(guess, guess))
+    # The tolerance is two units in the last place, leaf by leaf. It is taken once, at the
+    # first iterate, up to a factor of two. And this is the largest rounding error.
+    scales = _sizes(scale(first if in_halves else first.q))
+    weights = [_inverse(2 * eps * x) for x in scales]
+    rounding = ROUNDINGS * eps * _largest(scales)
+
+    # The size of the last correction, in units of the tolerance, and whether sweeps have
+    # converged, if the correction before had the size `size_before`.
+    def check(
+        old: Halves, new: Halves, size_before: Scalar
+    ) -> tuple[Scalar, Bool[Array, ""]]:
+        # For doubled equations the correction is the difference of the two halves, since
+        # only equal halves are a solution.
+        correction = (new**ω - old**ω).ω if in_halves else (new.q**ω - new.p**ω).ω
+        sizes = _sizes(correction)
+        size = _largest([x * weight for x, weight in zip(sizes, weights)])
+        # The next correction is expected to be `size * ratio` with the last ratio, `size /
+        # size_before`. If corrections grow, the ratio says nothing, and counts as one. So
+        # the condition is `2^LOG2_MARGIN * size * min(ratio, 1) <= 1`, and here both sides
+        # are multiplied by `size_before`, since a division takes long.
+        ratio_times_size_before = jnp.where(size < size_before, size, size_before)
+        is_next_small = 2.0**LOG2_MARGIN * size * ratio_times_size_before <= size_before
+        # Rounding errors do not shrink any further.
+        is_stalled = size >= 2.0**LOG2_STALLED * size_before
+        is_rounding = _largest(sizes) <= rounding
+        return size, is_next_small | (is_stalled & is_rounding)
+
+    # Three sweeps come before the loop: they make two corrections, whose ratio is the rate
+    # of convergence. Of the first correction only the size is needed: there is none before
+    # to compare with.
+    second = sweep(first)
+    third = sweep(second)
+    size_before, _ = check(first, second, one)
+    size, is_solved = check(second, third, size_before)
     # The relaxation is chosen once: later rates are those of relaxed sweeps, to which its
     # formula does not apply. It is a branch, since few paths take it, and a division takes
     # as long as a sweep.
@@ -170,9 +132,8 @@ def solve_one_path(
     )
 
     def sweep_again(state: _SweepState) -> _SweepState:
-        y = equations.sweep(state.y, relaxation)
-        correction = equations.correction(state.y, y)
-        size, is_solved = criterion.measure(correction, state.size)
+        y = sweep(state.y, relaxation)
+        size, is_solved = check(state.y, y, state.size)
         return _SweepState(y, size, is_solved, state.num_sweeps + 1)
 
     def goes_on(state: _SweepState) -> Bool[Array, ""]:
@@ -184,16 +145,11 @@ def solve_one_path(
     num_sweeps = jnp.full((), 3, jnp.int32)
     state = _SweepState(third, size, counts_as_solved, num_sweeps)
     end = lax.while_loop(goes_on, sweep_again, state)
-    return equations.solution(end.y), end.is_solved
-
-
-def _criterion(scale: PyTree[Array], dtype: Any) -> _Criterion:
-    """The criterion for states of size `scale`: corrections below two units in the last
-    place, leaf by leaf."""
-    eps = jnp.finfo(dtype).eps
-    scales = _sizes(scale)
-    weights = [_inverse(2 * eps * x) for x in scales]
-    return _Criterion(weights, ROUNDINGS * eps * _largest(scales))
+    # The halves of doubled equations differ by the last correction, which may be larger
+    # than the tolerance: convergence is decided by the next one. With the new half of
+    # another sweep, paths of a field with jumps were off by 0.7 units in the last place,
+    # and without by 49.
+    return end.y if in_halves else image(end.y.q), end.is_solved
 
 
 def _inverse(x: Scalar) -> Scalar:
@@ -219,13 +175,12 @@ def _sizes(y: PyTree[Array]) -> list[Scalar]:
 
 
 def _largest(numbers: list[Scalar]) -> Scalar:
-    return ft.reduce(_larger, numbers)
-
-
-def _larger(a: Scalar, b: Scalar) -> Scalar:
-    # `jnp.maximum` propagates NaN at the price of three operations. The check at the end of
-    # the step finds NaN in any case.
-    return jnp.where(a > b, a, b)
+    largest, *others = numbers
+    for x in others:
+        # `jnp.maximum` propagates NaN at the price of three operations. The check at the
+        # end of the step finds NaN in any case.
+        largest = jnp.where(largest > x, largest, x)
+    return largest
 
 
 class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
@@ -258,10 +213,20 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
 
 def by_sweeps_alone(solver: Any) -> Any:
     """The solver, and all solvers in it, with `Sweeps` in place of `PicardNewton`: without
-    Newton's method. Paths that fail are simulated again by JAX."""
+    Newton's method. Paths that fail are simulated again by JAX. Raises a `ValueError`
+    unless the tolerance is the default, rounding error."""
 
     def with_sweeps(implicit: Any) -> Any:
-        _check_tolerance(implicit.root_finder)
+        # Limits on the numbers of steps are not compared: they hold for JAX, which
+        # simulates the paths that are not solved here.
+        for name in ("rtol", "atol", "norm"):
+            value = getattr(implicit.root_finder, name)
+            if value != getattr(PicardNewton(), name):
+                raise ValueError(
+                    '`engine="drjit"` solves each step to rounding error; got '
+                    f"`PicardNewton({name}={value})`. Leave this out, or pass "
+                    '`engine="jax"`.'
+                )
         # Optimistix makes no iterations: `Sweeps` solves the equations before the first.
         return eqx.tree_at(
             lambda solver: (solver.root_finder, solver.root_find_max_steps),
@@ -270,17 +235,3 @@ def by_sweeps_alone(solver: Any) -> Any:
         )
 
     return with_changed_stages(solver, with_sweeps)
-
-
-def _check_tolerance(finder: PicardNewton) -> None:
-    """Raises a `ValueError` unless the tolerance is the default, rounding error. (Limits on
-    the numbers of steps are not compared: they hold for JAX, which simulates the paths that
-    are not solved here.)"""
-    default = PicardNewton()
-    for name in ("rtol", "atol", "norm"):
-        if getattr(finder, name) != getattr(default, name):
-            raise ValueError(
-                '`engine="drjit"` solves each step to rounding error; got '
-                f"`PicardNewton({name}={getattr(finder, name)})`. Leave this out, or pass "
-                '`engine="jax"`.'
-            )

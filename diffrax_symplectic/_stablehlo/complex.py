@@ -14,10 +14,6 @@ from .backend import dr
 from .elementwise import elementwise, is_zero
 
 
-def is_complex(a: Any) -> bool:
-    return dr.is_complex_v(a)
-
-
 def _divide(a, b):
     """`a conj(b) / |b|^2`, scaled so that no square overflows."""
     if is_zero(b.imag):

@@ -10,7 +10,7 @@ from .tensor import (
     as_own_literal,
     copied_entries,
     entries_of,
-    known_values,
+    known_value,
     Tensor,
     tensors_from,
 )
@@ -43,10 +43,10 @@ def _raises(region: Any) -> bool:
 def _case(operation: Operation, index: Tensor) -> list[Tensor]:
     regions = operation.mlir_op.regions
     last = len(regions) - 1
-    value = known_values(index)
+    value = known_value(index)
     if value is not None:
         # An index that is out of range stands for the last branch.
-        return operation.run(int(value) if 0 <= value <= last else last, [])
+        return operation.run(value if 0 <= value <= last else last, [])
     # A kernel cannot raise an error. Lanes whose branch would raise one are marked as
     # failed, and take the last of the other branches.
     branches = {}
@@ -60,7 +60,7 @@ def _case(operation: Operation, index: Tensor) -> list[Tensor]:
 
 @rule
 def _if(operation: Operation, condition: Tensor) -> list[Tensor]:
-    value = known_values(condition)
+    value = known_value(condition)
     if value is not None:
         return operation.run(_IF_TRUE if value else _IF_FALSE, [])
     # With `select` in its place both branches run: the midpoint rule, whose sweeps have
@@ -130,7 +130,7 @@ def _while(operation: Operation, *xs: Tensor) -> list[Tensor]:
     # then, or after too many, are a loop of the kernel.
     for _ in range(max_unrolled):
         (condition,) = operation.run(_CONDITION, state)
-        goes_on = known_values(condition)
+        goes_on = known_value(condition)
         if goes_on is None:
             break
         if not goes_on:

@@ -329,19 +329,15 @@ def _round_half_away(a):
 @ft.cache
 def elementwise() -> dict[str, Callable[..., Any]]:
     """The functions, by their names in StableHLO and CHLO."""
-    return {
-        "abs": dr.abs,
-        "acos": dr.acos,
-        "acosh": dr.acosh,
+    of_same_name = (
+        "abs acos acosh asin asinh cbrt ceil floor log popcnt sqrt square".split()
+    )
+    return {name: getattr(dr, name) for name in of_same_name} | {
         "add": _add,
         "and": operator.and_,
-        "asin": dr.asin,
-        "asinh": dr.asinh,
         "atan": _atan,
         "atan2": _atan2,
         "atanh": _atanh,
-        "cbrt": dr.cbrt,
-        "ceil": dr.ceil,
         "clamp": _clamp,
         "cosh": _cosh,
         "cosine": dr.cos,
@@ -352,9 +348,7 @@ def elementwise() -> dict[str, Callable[..., Any]]:
         "erfc": _erfc,
         "exponential": dr.exp,
         "exponential_minus_one": _expm1,
-        "floor": dr.floor,
         "is_finite": dr.isfinite,
-        "log": dr.log,
         "log_plus_one": _log1p,
         "logistic": _logistic,
         "maximum": _maximum,
@@ -363,7 +357,6 @@ def elementwise() -> dict[str, Callable[..., Any]]:
         "negate": operator.neg,
         "not": operator.invert,
         "or": operator.or_,
-        "popcnt": dr.popcnt,
         "power": _power,
         "remainder": _remainder,
         "round_nearest_afz": _round_half_away,
@@ -375,8 +368,6 @@ def elementwise() -> dict[str, Callable[..., Any]]:
         "sign": _sign,
         "sine": dr.sin,
         "sinh": _sinh,
-        "sqrt": dr.sqrt,
-        "square": dr.square,
         "subtract": operator.sub,
         "tan": _tan,
         "tanh": _tanh,

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from .backend import array_types, dr
-from .complex import equal, is_complex
+from .complex import equal
 from .integers import to_integer
 from .mlir import constant_values
 from .operation import Operation, rule
-from .tensor import constant, entries_of, is_same_table, map_entries, Tensor
+from .tensor import constant, entries_of, map_entries, Table, Tensor
 
 
 @rule
@@ -86,8 +86,12 @@ def _select(
     operation: Operation, mask: Tensor, if_true: Tensor, if_false: Tensor
 ) -> list[Tensor]:
     # `vmap` of a conditional selects between two equal tables: one stays in memory.
-    if is_same_table(if_true.entries, if_false.entries):
-        return [if_true]
+    one = if_true.entries
+    other = if_false.entries
+    if isinstance(one, Table) and isinstance(other, Table):
+        has_same_addresses = np.array_equal(one.addresses, other.addresses)
+        if one.memory is other.memory and has_same_addresses:
+            return [if_true]
     return [map_entries(dr.select, mask, if_true, if_false)]
 
 
@@ -129,7 +133,9 @@ def _compare(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
     if direction not in ("eq", "ne"):
         return [map_entries(getattr(operator, direction), a, b)]
     # Complex numbers have no order, and are equal if both parts are.
-    is_equal = map_entries(equal if is_complex(a.entries[0]) else operator.eq, a, b)
+    is_equal = map_entries(
+        equal if dr.is_complex_v(a.entries[0]) else operator.eq, a, b
+    )
     # NaN differs from everything. In Dr.Jit NaN != NaN is false, unless it is folded.
     return [is_equal if direction == "eq" else map_entries(operator.invert, is_equal)]
 

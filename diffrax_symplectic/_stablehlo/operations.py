@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any
 
 from .backend import dr
-from .complex import complex_functions, is_complex, log_of_power
+from .complex import complex_functions, log_of_power
 from .elementwise import elementwise
 from .operation import NotReplayed, Operation
 from .tensor import map_entries, Tensor
@@ -22,11 +22,9 @@ def _itself(a):
 
 
 # For each function, the angle whose sine or cosine it takes, as a function of its operands.
-_ANGLES_OF_REAL: dict[str, Callable[..., Any]] = {
-    "cosine": _itself,
-    "sine": _itself,
-    "tan": _itself,
-}
+_ANGLES_OF_REAL: dict[str, Callable[..., Any]] = dict.fromkeys(
+    ("cosine", "sine", "tan"), _itself
+)
 _ANGLES_OF_COMPLEX: dict[str, Callable[..., Any]] = {
     "cosine": operator.attrgetter("real"),
     "exponential": operator.attrgetter("imag"),
@@ -43,7 +41,7 @@ def entry_by_entry(operation: Operation, *xs: Tensor) -> list[Tensor]:
     if of_real is None and of_complex is None:
         raise NotReplayed(operation.mlir_op)
     # There is a first entry: `Replay` asks for no rule of arrays without entries.
-    has_complex_operand = any(is_complex(x.entries[0]) for x in xs)
+    has_complex_operand = any(dr.is_complex_v(x.entries[0]) for x in xs)
     function = of_complex if has_complex_operand else of_real
     angles = _ANGLES_OF_COMPLEX if has_complex_operand else _ANGLES_OF_REAL
     if function is None:

@@ -48,7 +48,6 @@ class Replay:
             if op.name == "stablehlo.constant"
             and _type_of(op.results[0]).size > MOST_IN_REGISTERS
         }
-        self._memory: dict[Any, Any] = {}
 
     @property
     def arguments(self) -> list[ArrayType]:
@@ -92,76 +91,67 @@ class Replay:
         """The results, and masks of the lanes that raise an error.
 
         `constants` are what `self.constants()` returned. Without it, large constants are
-        written into the kernel. One call at a time: they are kept during the call.
+        written into the kernel.
         """
-        # `_results` looks here whether a constant is in memory; empty without `constants`.
-        self._memory = dict(zip(self._constants, constants))
+        memory = dict(zip(self._constants, constants))
         # Operations that fail append their masks.
         failures: list[Any] = []
-        results = self._call("main", args, failures)
-        return results, failures
 
-    def _call(
-        self, name: str, args: Sequence[Tensor], failures: list[Any]
-    ) -> list[Tensor]:
-        """The results of a function of the program, which sees its arguments only."""
-        return self._run_block(
-            block_of(self._functions[name]), args, ChainMap(), failures
-        )
+        def call(name: str, args: Sequence[Tensor]) -> list[Tensor]:
+            # A function of the program sees its arguments only.
+            return run_block(block_of(self._functions[name]), args, ChainMap())
 
-    def _run_block(
-        self, block: Any, args: Sequence[Tensor], outer: Values, failures: list[Any]
-    ) -> list[Tensor]:
-        """What a block returns, whose operations run one after another. `outer` holds the
-        variables that it sees from outside."""
-        values = outer.new_child(dict(zip(block.arguments, args)))
-        for view in block.operations:
-            # The general form of an operation, for which MLIR may have a class of its own.
-            op = view.operation
-            operands = [values[operand] for operand in op.operands]
-            if op.name in _RETURNS:
-                return operands
-            results = self._results(op, operands, values, failures)
-            values.update(zip(op.results, results))
-        raise AssertionError("A block ends with what it returns.")
+        # The results of a block, whose operations run one after another. `outer` holds the
+        # variables that it sees from outside.
+        def run_block(
+            block: Any, args: Sequence[Tensor], outer: Values
+        ) -> list[Tensor]:
+            values = outer.new_child(dict(zip(block.arguments, args)))
+            for view in block.operations:
+                # The general form of an operation, for which MLIR may have a class of its
+                # own.
+                op = view.operation
+                operands = [values[operand] for operand in op.operands]
+                if op.name in _RETURNS:
+                    return operands
+                values.update(zip(op.results, results_of(op, operands, values)))
+            raise AssertionError("A block ends with what it returns.")
 
-    def _results(
-        self, op: Any, operands: list[Tensor], values: Values, failures: list[Any]
-    ) -> list[Tensor]:
-        """The results of one operation."""
-        if op.name == "func.call":
+        def results_of(op: Any, operands: list[Tensor], values: Values) -> list[Tensor]:
+            if op.name == "func.call":
+                try:
+                    return call(callee_of(op), operands)
+                except NotReplayed as error:
+                    # An operation in a called function has no location in its caller.
+                    error.location += str(op.location)
+                    raise
+            # A large constant stays in memory, where the caller has put it.
+            if op.results and op.results[0] in memory:
+                constant = self._constants[op.results[0]]
+                places = np.arange(constant.size)
+                table = Table(memory[op.results[0]], places, constant.ravel())
+                return [Tensor(table, constant.shape)]
+            # Rules need not treat results without entries: there is nothing to compute. (A
+            # token, which orders side effects, has no shape.)
+            shapes = [tuple(getattr(result.type, "shape", ())) for result in op.results]
+            if shapes and all(0 in shape for shape in shapes):
+                return [Tensor([], shape) for shape in shapes]
+
+            def run(i: int, args: Sequence[Tensor]) -> list[Tensor]:
+                return run_block(block_of(op, i), args, values)
+
+            operation = Operation(op, run, failures)
+            rule = RULES.get(operation.name, entry_by_entry)
             try:
-                return self._call(callee_of(op), operands, failures)
-            except NotReplayed as error:
-                # An operation in a called function has no location in its caller.
-                error.location += str(op.location)
-                raise
-        # A large constant stays in memory, where the caller has put it.
-        if op.results and op.results[0] in self._memory:
-            return [self._table(op.results[0])]
-        # Rules need not treat results without entries: there is nothing to compute.
-        if op.results and all(map(_is_empty, op.results)):
-            return [Tensor([], tuple(result.type.shape)) for result in op.results]
+                return rule(operation, *operands)
+            except (TypeError, RuntimeError) as error:
+                if _names_an_operation(error):
+                    raise
+                # An error of Dr.Jit names neither the operation nor its place.
+                what = f"`{op.name}` of these types ({error})"
+                raise NotReplayed(op, what) from error
 
-        def run(i: int, args: Sequence[Tensor]) -> list[Tensor]:
-            return self._run_block(block_of(op, i), args, values, failures)
-
-        operation = Operation(op, run, failures)
-        rule = RULES.get(operation.name, entry_by_entry)
-        try:
-            return rule(operation, *operands)
-        except (TypeError, RuntimeError) as error:
-            if _names_an_operation(error):
-                raise
-            # An error of Dr.Jit names neither the operation nor its place.
-            raise NotReplayed(op, f"`{op.name}` of these types ({error})") from error
-
-    def _table(self, variable: Any) -> Tensor:
-        """A large constant, which stays in memory."""
-        values = self._constants[variable]
-        places = np.arange(values.size)
-        table = Table(self._memory[variable], places, values.ravel())
-        return Tensor(table, values.shape)
+        return call("main", args), failures
 
 
 def _type_of(variable: Any) -> ArrayType:
@@ -174,12 +164,6 @@ def _names_an_operation(error: BaseException | None) -> bool:
     while error is not None and not isinstance(error, NotReplayed):
         error = error.__cause__ or error.__context__
     return error is not None
-
-
-def _is_empty(variable: Any) -> bool:
-    """Whether a variable is an array without entries."""
-    # A token, which orders side effects, has no shape.
-    return 0 in getattr(variable.type, "shape", ())
 
 
 def _operations_within(op: Any) -> Iterator[Any]:

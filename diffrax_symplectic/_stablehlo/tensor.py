@@ -29,6 +29,7 @@ class ArrayType:
         return math.prod(self.shape)
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class Table(Sequence):
     """The entries of an array that all paths share: positions in an array of Dr.Jit in
     memory. An entry is read where a rule asks for it; each path may ask for its own.
@@ -39,27 +40,19 @@ class Table(Sequence):
         operations with them can be folded.
     """
 
-    def __init__(
-        self, memory: Any, addresses: np.ndarray, values: np.ndarray | None = None
-    ):
-        self.memory = memory
-        self.addresses = addresses
-        self.values = values
+    memory: Any
+    addresses: np.ndarray
+    values: np.ndarray | None = None
 
     def __len__(self) -> int:
         return len(self.addresses)
 
     def __getitem__(self, i: Any) -> Any:
-        if isinstance(i, slice):
-            return self.at_places(np.arange(len(self))[i])
         address = int(self.addresses[i])
         if self.values is not None:
             # A constant of the kernel, which costs no read of memory.
             return type(self.memory)(self.values[address].item())
         return self.gathered(array_types()["ui32"](address))
-
-    def at_places(self, places: np.ndarray) -> "Table":
-        return Table(self.memory, self.addresses[places], self.values)
 
     def gathered(self, addresses: Any) -> Any:
         """What is at these addresses in `memory`, one for each path."""
@@ -84,20 +77,15 @@ class Tensor:
         """The entries at these positions."""
         # Of a table, positions are moved, and nothing is read.
         if isinstance(self.entries, Table):
-            return Tensor(self.entries.at_places(places.ravel()), places.shape)
+            addresses = self.entries.addresses[places.ravel()]
+            table = dataclasses.replace(self.entries, addresses=addresses)
+            return Tensor(table, places.shape)
         return Tensor([self.entries[place] for place in places.flat], places.shape)
 
     def item(self) -> Any:
         """The entry of an array with a single one."""
         (entry,) = self.entries
         return entry
-
-
-def is_same_table(one: Sequence[Any], other: Sequence[Any]) -> bool:
-    """Whether both are the same part of the same array in memory."""
-    if not (isinstance(one, Table) and isinstance(other, Table)):
-        return False
-    return one.memory is other.memory and np.array_equal(one.addresses, other.addresses)
 
 
 def scalar(entry: Any) -> Tensor:
@@ -123,22 +111,15 @@ def array_in_memory(kind: str, values: np.ndarray) -> Any:
     return dtype(values.tolist())
 
 
-def known_values(x: Tensor) -> np.ndarray | None:
-    """The values of an array whose entries are constants, or were folded from constants by
-    Dr.Jit; `None` if an entry is not known while the kernel is recorded.
+def known_value(x: Tensor) -> Any | None:
+    """The value of an index or a condition, which is an array with a single entry, if that
+    is a constant, or was folded from constants by Dr.Jit; `None` if it is not known while
+    the kernel is recorded.
 
     With a known index, loops are unrolled and entries selected while recording.
     """
-    if not all(map(is_literal, x.entries)):
-        return None
-    return np.array([_value(entry) for entry in x.entries]).reshape(x.shape)
-
-
-def _value(literal: Any) -> Any:
-    """The number in a literal of Dr.Jit."""
-    if dr.is_complex_v(literal):
-        return complex(literal.real[0], literal.imag[0])
-    return literal[0]
+    entry = x.item()
+    return entry[0] if is_literal(entry) else None
 
 
 def map_entries(fn: Callable, *xs: Tensor) -> Tensor:

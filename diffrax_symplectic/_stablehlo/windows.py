@@ -25,7 +25,7 @@ from .operation import ONLY_REGION, Operation, rule
 from .tensor import (
     constant,
     entries_of,
-    known_values,
+    known_value,
     map_entries,
     scalar,
     Table,
@@ -43,11 +43,11 @@ def _possible_starts(start: Tensor, last: int, is_clipped: bool) -> dict[int, An
     the mask of the lanes whose window begins there. If it `is_clipped`, an index out of
     range counts as the nearest of these; otherwise its window begins nowhere."""
     every_lane = array_types()["i1"](True)
-    value = known_values(start)
+    value = known_value(start)
     if is_clipped and (value is not None or last == 0):
-        return {0 if value is None else int(np.clip(value, 0, last)): every_lane}
+        return {min(max(value or 0, 0), last): every_lane}
     if value is not None:
-        return {int(value): every_lane} if 0 <= value <= last else {}
+        return {value: every_lane} if 0 <= value <= last else {}
     index = _widened(start.item())
     masks = {begin: index == begin for begin in range(last + 1)}
     if is_clipped:
@@ -96,7 +96,7 @@ def _window_at(
 ) -> Tensor:
     """The window of `x` that begins at `starts`, moved into `x` if it is not within. Both
     `starts` and `sizes` have an element for each axis."""
-    is_known = all(known_values(start) is not None for start in starts)
+    is_known = all(known_value(start) is not None for start in starts)
     if isinstance(x.entries, Table) and not is_known:
         return _window_of_table(operation, x, x.entries, starts, sizes)
     windows = _possible_windows(operation, x, starts, sizes)
@@ -112,13 +112,24 @@ def _window_of_table(
 ) -> Tensor:
     """As `_window_at`, where the entries of `x` are those of the `table` in memory. Each
     path reads its own window."""
-    # `x` may be a part of what is in memory, or its transpose.
+    # `x` may be a part of what is in memory, or its transpose: for each of its axes, the
+    # distance in memory between neighbours along it.
     addresses = table.addresses.reshape(x.shape)
-    strides = _strides(operation, addresses)
-    int32 = array_types()["i32"]
+    first = int(addresses.flat[0])
+    strides = [
+        int(addresses.take(1, axis).flat[0]) - first if size > 1 else 0
+        for axis, size in enumerate(x.shape)
+    ]
+    # Entries that were moved in another way than by slices and transposes have no strides.
+    if not np.array_equal(first + _offsets(strides, x.shape), addresses):
+        raise operation.refusal(
+            "with an index per path, from an array whose entries were moved other than by "
+            "slices and transposes"
+        )
     # The address of the window's first entry: that of the first entry of `x`, and a stride
     # for each index.
-    first_address = int32(int(addresses.flat[0]))
+    int32 = array_types()["i32"]
+    first_address = int32(first)
     for start, stride, length, size in zip(starts, strides, x.shape, sizes):
         index = _widened(start.item())
         dtype = type(index)
@@ -134,31 +145,9 @@ def _window_of_table(
     return Tensor(entries, tuple(sizes))
 
 
-def _strides(operation: Operation, addresses: np.ndarray) -> list[int]:
-    """For each axis of an array in memory, the distance between neighbours along it,
-    from the addresses of the entries. Raises a `NotReplayed` if distances differ along an
-    axis."""
-    first = int(addresses.flat[0])
-    strides = [
-        int(addresses.take(1, axis).flat[0]) - first if size > 1 else 0
-        for axis, size in enumerate(addresses.shape)
-    ]
-    # Entries that were moved in another way than by slices and transposes have no strides.
-    if not np.array_equal(first + _offsets(strides, addresses.shape), addresses):
-        raise operation.refusal(
-            "with an index per path, from an array whose entries were moved other than by "
-            "slices and transposes"
-        )
-    return strides
-
-
 def _offsets(strides: Sequence[int], shape: Sequence[int]) -> np.ndarray:
     """How far in memory each entry of an array of this shape is from the first."""
-    # `sparse` indices of an axis have length one along all others.
-    indices = np.indices(shape, sparse=True)
-    total = sum(stride * index for stride, index in zip(strides, indices))
-    # Without axes the sum is the number zero.
-    return np.broadcast_to(total, shape)
+    return np.tensordot(np.array(strides, int), np.indices(shape), axes=1)
 
 
 def _widened(index: Any) -> Any:
@@ -190,7 +179,7 @@ def _dynamic_update_slice(
 def _windows(
     x: Tensor,
     indices: Tensor,
-    vector_axis: int,
+    index_vector_dim: list[int],
     axes: Sequence[int],
     batched_axes: dict[int, int],
 ) -> tuple[tuple[int, ...], list[list[Tensor]]]:
@@ -198,11 +187,13 @@ def _windows(
     array of windows, and for each window, in row-major order, its start along each axis of
     `x`.
 
-    `indices` holds a vector for each window, along the axis `vector_axis`: the starts of
-    the window along each of `axes`. `batched_axes` maps axes of `x` to axes of `indices`:
-    along these, a window starts at its own position in the array of windows. Along all
-    other axes windows start at zero.
+    `indices` holds a vector for each window, along the axis `index_vector_dim`: the starts
+    of the window along each of `axes`. `batched_axes` maps axes of `x` to axes of
+    `indices`: along these, a window starts at its own position in the array of windows.
+    Along all other axes windows start at zero.
     """
+    # This number is printed only if it is not zero: an empty list has the sum zero.
+    vector_axis = sum(index_vector_dim)
     # If `indices` have no such axis, each vector is a single number.
     places = indices.places
     if vector_axis == places.ndim:
@@ -232,8 +223,7 @@ def _gather(operation: Operation, x: Tensor, indices: Tensor) -> list[Tensor]:
     shape, starts_of_windows = _windows(
         x,
         indices,
-        # This number is printed only if it is not zero: an empty list has the sum zero.
-        vector_axis=sum(part("index_vector_dim")),
+        index_vector_dim=part("index_vector_dim"),
         axes=part("start_index_map"),
         batched_axes=dict(zip(batched_axes, part("start_indices_batching_dims"))),
     )
@@ -260,8 +250,7 @@ def _scatter(
     shape, starts_of_windows = _windows(
         x,
         indices,
-        # As in `_gather`, an empty list stands for zero.
-        vector_axis=sum(part("index_vector_dim")),
+        index_vector_dim=part("index_vector_dim"),
         axes=part("scatter_dims_to_operand_dims"),
         batched_axes=dict(zip(batched_axes, part("scatter_indices_batching_dims"))),
     )
