@@ -1,7 +1,6 @@
 """What `expectation` chooses: the law of the increments, the sampling, and its plan."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax.random as jr
 import numpy as np
@@ -94,7 +93,17 @@ def choose(
 
     why_sampling = ""
     if sampling is not None:
-        _check_sampling(sampling, start)
+        if not isinstance(sampling, AbstractSampling):
+            names = ", ".join(f"`{name}`" for name in SAVED_SAMPLINGS)
+            raise ValueError(
+                f"`sampling` must be an instance of one of {names}, or `None`; got "
+                f"{sampling!r}."
+            )
+        if start is not None and type(start.sampling) is not type(sampling):
+            raise ValueError(
+                f"`start` was sampled by {start.sampling}; got sampling={sampling}. Pass "
+                "the same `sampling`."
+            )
         plan = plan_for(sampling)
     else:
         sampling, why_sampling = sampling_for(problem, tol, engine)
@@ -132,22 +141,6 @@ def choose(
 def trial_key(key: PRNGKeyArray) -> PRNGKeyArray:
     """The key of trials, which are not part of the estimate."""
     return jr.fold_in(key, _TRIAL_KEY)
-
-
-def _check_sampling(sampling: Any, start: Expectation | None) -> None:
-    """Raises a `ValueError` if this is not a sampling, or if `start` was sampled by one of
-    another class."""
-    if not isinstance(sampling, AbstractSampling):
-        names = ", ".join(f"`{name}`" for name in SAVED_SAMPLINGS)
-        raise ValueError(
-            f"`sampling` must be an instance of one of {names}, or `None`; got "
-            f"{sampling!r}."
-        )
-    if start is not None and type(start.sampling) is not type(sampling):
-        raise ValueError(
-            f"`start` was sampled by {start.sampling}; got sampling={sampling}. Pass the "
-            "same `sampling`."
-        )
 
 
 def sampling_for(

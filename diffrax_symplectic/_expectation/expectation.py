@@ -23,6 +23,7 @@ from .._simulation import (
 from .._solver import own_path
 from .._terms import (
     brownian_paths,
+    constraint_of,
     motion_numbers,
     random_paths,
     with_paths,
@@ -41,12 +42,11 @@ from .fused_paths import FusedPaths
 from .jumps import jumps_at_step_ends, jumps_within_steps
 from .kinks import has_kinks
 from .long_steps import (
-    may_be_too_long,
     too_long_steps,
     unresolved_angle,
     unresolved_noise,
 )
-from .out_of_range import out_of_range
+from .out_of_range import is_finite_at_start, out_of_range
 from .progress import NO_METER, Progress
 from .run import Kept, run
 from .sampling import AbstractSampling
@@ -271,7 +271,9 @@ def _messages_on_result(
     if lost_numbers is not None and most_fail:
         return [*cautions(estimate, tol, advice=lost_numbers)]
     advice = advice_on_failures(problem)
-    if most_fail and may_be_too_long(problem):
+    is_explicit = not problem.is_implicit and constraint_of(problem.terms) is None
+    # If the first evaluation fails, too, the length of steps is not the cause.
+    if most_fail and is_explicit and is_finite_at_start(problem):
         shorter = dt0 / max(4, unresolved_angle(problem) or 0)
         advice = (
             f"Most likely, steps of `dt0={dt0:g}` are too long for "

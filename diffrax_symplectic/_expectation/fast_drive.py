@@ -2,7 +2,6 @@
 
 import functools as ft
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -83,11 +82,11 @@ def _departure(
     """The root mean square, over all steps, by which a field departs from the straight line
     between its values at the first and the last time of a step, divided by that by which it
     departs from its mean over the step; zero if it changes little."""
-    at_both = at_both_states(field, y0)
+    values_at = at_both_states(field, y0)
 
     def squares(times: Float[Array, " times"]) -> Float[Array, "3"]:
         """The sums of squares of both departures and of the field, over one step."""
-        values = jax.vmap(at_both)(times)
+        values = values_at(times)
         fractions = (times - times[0]) / (times[-1] - times[0])
         line = values[0] + fractions[:, None] * (values[-1] - values[0])
         from_line = jnp.sum((values - line) ** 2)

@@ -76,11 +76,13 @@ def depends_on_time(field: Field, t0: Array, y0: Y) -> bool:
     return not dependence.independent(lambda t: t)
 
 
-def at_both_states(field: Field, y0: Y) -> Callable[[Array], Float[Array, " n"]]:
-    """The function from a time to the field at two states, as one vector: at `y0`, and at
-    an arbitrary state about as far from `y0` as `y0` is from zero. (At `y0` alone a change
-    may not show: in a trap that is stiffened, the force on a particle at its centre is
-    always zero.)"""
+def at_both_states(
+    field: Field, y0: Y
+) -> Callable[[Float[Array, " times"]], Float[Array, "times n"]]:
+    """The function from times to the field at two states, as one vector for each time: at
+    `y0`, and at an arbitrary state about as far from `y0` as `y0` is from zero. (At `y0`
+    alone a change may not show: in a trap that is stiffened, the force on a particle at its
+    centre is always zero.)"""
 
     def with_moved(x: PyTree[Array]) -> Array:
         x = jnp.asarray(x)
@@ -94,7 +96,7 @@ def at_both_states(field: Field, y0: Y) -> Callable[[Array], Float[Array, " n"]]
     def at_both(t: Array) -> Float[Array, " n"]:
         return jax.vmap(field, in_axes=(None, 0))(t, both).reshape(-1)
 
-    return at_both
+    return jax.vmap(at_both)
 
 
 def spread_evenly(number: int) -> Float[np.ndarray, " number"]:

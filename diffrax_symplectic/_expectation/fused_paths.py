@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
 from .._custom_types import Devices
-from .._simulation import by_drjit, combinations, Level, Problem, state_itself
-from .independent import IndependentPaths
-from .sampling import Averaged, Outputs, Samples, SamplingPlan
+from .._simulation import by_drjit, Level, Problem, state_itself
+from .independent import IndependentPaths, samples_of_paths
+from .sampling import Outputs, Samples, SamplingPlan
 
 
 # The default number of paths in a batch: many, since each call of the kernel takes a while
@@ -104,9 +104,5 @@ def _samples_of_fused_paths(
     # (levels, n, S, m)
     phi = jax.vmap(values_on_level)(problem.levels, states)
     failed = failed | ~jnp.all(jnp.isfinite(phi), axis=(2, 3))
-    values = combinations(problem.weights, phi.reshape(*phi.shape[:2], -1))
-    return Samples(
-        averaged=Averaged(values),
-        good=~jnp.any(failed, axis=0),
-        num_failed=failed,
-    )
+    values = phi.reshape(*phi.shape[:2], -1)
+    return samples_of_paths(problem.weights, values, failed)

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, Key
+from jaxtyping import Array, Bool, Float, Key
 
 from .._arguments import check_memory, whole_number
 from .._custom_types import Devices
@@ -79,8 +79,15 @@ def _samples_of_independent_paths(problem: Problem, keys: Key[Array, " n"]) -> S
     """A sample is a path, with the same random key on all levels."""
     # (levels, S, n, m) and (levels, n)
     values, failed = values_of_paths(problem, keys)
-    return Samples(
-        averaged=Averaged(combinations(problem.weights, as_vectors(values))),
-        good=~jnp.any(failed, axis=0),
-        num_failed=failed,
-    )
+    return samples_of_paths(problem.weights, as_vectors(values), failed)
+
+
+def samples_of_paths(
+    weights: Float[Array | np.ndarray, "combinations levels"],
+    values: Float[Array, "levels n numbers"],
+    failed: Bool[Array, "levels n"],
+) -> Samples:
+    """The samples of independent paths: combinations of their values on all levels, with
+    these weights, and which of them failed."""
+    averaged = Averaged(combinations(weights, values))
+    return Samples(averaged, good=~jnp.any(failed, axis=0), num_failed=failed)

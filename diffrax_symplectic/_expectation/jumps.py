@@ -239,12 +239,11 @@ def _search(
 ) -> tuple[Float[Array, " searched"], Bool[Array, " searched"]]:
     """For the `intervals`, from a start to an end, in which a field changes most: the time
     at which it changes fastest, and whether it jumps there, by its values `around` it."""
-    at_both = at_both_states(field, y0)
+    values_at = at_both_states(field, y0)
 
     def changes(times: Float[Array, " times"]) -> Float[Array, " intervals"]:
         """The changes from each time to the next."""
-        values = jax.vmap(at_both)(times)
-        return jnp.linalg.norm(jnp.diff(values, axis=0), axis=1)
+        return jnp.linalg.norm(jnp.diff(values_at(times), axis=0), axis=1)
 
     def with_middle(interval: Float[Array, "2"]) -> Float[Array, "3"]:
         start, end = interval
@@ -263,7 +262,7 @@ def _search(
         times = jnp.linspace(interval[0], interval[1], _PARTS_OF_STEP + 1)
         part = times[jnp.argmax(changes(times)) + jnp.arange(2)]
         time = jnp.mean(lax.fori_loop(0, halvings, half_that_changes_more, part))
-        sides = jax.vmap(at_both)(time + around)
+        sides = values_at(time + around)
         jump = jnp.linalg.norm(sides[2] - sides[1])
         return time, jump > _largest_smooth_change(sides)
 
@@ -280,11 +279,11 @@ def _jumps_at_ends(
     """For the end of each step, whether a field jumps there, and does not have the mean of
     both sides as its value, which would be right. `times` are far and near before the end,
     near and far after it, and the end itself."""
-    at_both = at_both_states(field, y0)
+    values_at = at_both_states(field, y0)
 
     def jumps_at(end: tuple[Array, Array]) -> Bool[Array, ""]:
         times, is_last = end
-        values = jax.vmap(at_both)(times)
+        values = values_at(times)
         sides = values[:4]
         value = values[4]
         off_mean = jnp.linalg.norm(value - (sides[1] + sides[2]) / 2)

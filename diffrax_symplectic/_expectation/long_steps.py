@@ -3,7 +3,6 @@ start."""
 
 import functools as ft
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,7 @@ import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, PRNGKeyArray
 
 from .._brownian import zeros_and_unravel
 from .._compat import unwrapped
@@ -41,9 +40,6 @@ _UNSTABLE = 1.1
 # After this many steps of the tangent flow any change of the state points in the most
 # unstable direction. Its growth is measured over as many more steps.
 _ITERATIONS_FOR_INSTABILITY = 50
-# The fraction of `dt0` that is surely short enough. If such a step fails, too, the length
-# of steps is not the cause.
-_SURELY_SHORT_FRACTION = 1e-6
 # Where noise turns the state by more than this in a step, as a standard deviation, two
 # levels may agree on a wrong mean. Measured for the mean square of the site of an exciton
 # on 3 and 7 sites with noise, by `ImplicitMidpoint`: at 1.4 and below the mean is within
@@ -190,15 +186,6 @@ def unresolved_noise(problem: Problem, dt0: float) -> str | None:
     )
 
 
-def may_be_too_long(problem: Problem) -> bool:
-    """Whether the length of steps is the likely cause if most paths fail: for a solver
-    without implicit equations whose step without noise succeeds from `y0` if it is very
-    short, with a finite `phi` after it."""
-    if problem.is_implicit or not _has_step_without_noise(problem):
-        return False
-    return bool(_short_step_succeeds(problem))
-
-
 def _has_step_without_noise(problem: Problem) -> bool:
     """Whether increments can be set to zero."""
     if constraint_of(problem.terms) is not None:
@@ -253,28 +240,14 @@ def _noise_reads_state(problem: Problem) -> bool:
     return not dependence.independent(lambda y, controls: y)
 
 
-def _terms_without_noise(problem: Problem, h: Any) -> PyTree:
-    """The terms with increments of zero."""
-    variables = problem.variables(h)
-    return variables.terms_with(jnp.zeros(len(variables.laws)))
-
-
-@ft.partial(compiled, quickly=True)
-def _short_step_succeeds(problem: Problem) -> Bool[Array, ""]:
-    """Whether a very short step without noise succeeds, with a finite `phi` after it."""
-    h = _SURELY_SHORT_FRACTION * problem.level(0).h
-    terms = _terms_without_noise(problem, h)
-    state = problem.init(terms, 0, h, problem.y0)
-    y, _, success = problem.step(terms, 0, h, problem.y0, state)
-    return success & jnp.all(jnp.isfinite(problem.values(problem.t0, y)))
-
-
 @ft.partial(compiled, quickly=True)
 def _growth_in_steps(problem: Problem, numbers: Float[Array, " times"]) -> Growth:
     """For each of the steps with these numbers, started from `y0`: the growth of the change
     of `y0` that the derivative of the step enlarges most."""
     h = problem.level(0).h
-    terms = _terms_without_noise(problem, h)
+    # With increments of zero.
+    variables = problem.variables(h)
+    terms = variables.terms_with(jnp.zeros(len(variables.laws)))
 
     def step(number: Float[Array, ""], y: Y) -> Y:
         state = problem.init(terms, number, h, y)

@@ -24,7 +24,6 @@ from .._programs import current_traces, digest, Traced, traced
 from .._root_finder import all_finite
 from .._simulation import (
     advice_on_failures,
-    combinations,
     Layout,
     level_weights,
     MOST_LEVELS,
@@ -32,10 +31,10 @@ from .._simulation import (
 )
 from .call import checked_call
 from .estimate import cautions, Expectation
-from .independent import IndependentPaths
+from .independent import IndependentPaths, samples_of_paths
 from .progress import NO_METER, Progress
 from .run import Kept, run
-from .sampling import Averaged, Outputs, Samples
+from .sampling import Outputs, Samples
 
 
 def monte_carlo(
@@ -182,11 +181,7 @@ def _samples_of_programs(
     # (levels, n, numbers) and (levels, n)
     values = jnp.stack([jax.vmap(real_vector)(phi) for phi, _ in phi_and_success])
     success = jnp.stack([success for _, success in phi_and_success])
-    return Samples(
-        averaged=Averaged(combinations(weights, values)),
-        good=jnp.all(success, axis=0),
-        num_failed=~success,
-    )
+    return samples_of_paths(weights, values, ~success)
 
 
 def _value_and_success(

@@ -1,5 +1,7 @@
 """Numbers that the precision of the state cannot hold, as in SI units in float32."""
 
+import functools as ft
+import itertools
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -8,9 +10,10 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
+from jaxtyping import Array, PyTree
 
 from .._compat import CALLS, results_of_operation, results_of_program
-from .._custom_types import Terms
+from .._custom_types import Y
 from .._simulation import Problem
 from .._terms import BathNoise, control_struct, split_terms
 
@@ -25,11 +28,9 @@ def out_of_range(problem: Problem, all_fail: bool) -> str | None:
     `all_fail` (whether paths do), an operation whose result is out of range where paths
     start. Two sentences for messages, or `None`."""
     precision = jnp.finfo(problem.dtype)
-    drift, noise = split_terms(problem.terms)
-    terms = (*drift, *noise)
-    found = next(_lost_arguments(problem, terms), None)
+    found = next(_lost_arguments(problem), None)
     if found is None and all_fail:
-        found = _lost_on_the_way(problem, terms)
+        found = _lost_on_the_way(problem)
     if found is None:
         return None
     more_digits = ""
@@ -41,13 +42,14 @@ def out_of_range(problem: Problem, all_fail: bool) -> str | None:
     return f"In {precision.dtype}, {found}. {advice[0].upper()}{advice[1:]}"
 
 
-def _lost_arguments(problem: Problem, terms: Terms) -> Iterator[str]:
+def _lost_arguments(problem: Problem) -> Iterator[str]:
     """Names each argument with an array in which all numbers count as zero, though not all
     are, or a finite one counts as infinite."""
     arguments = {"y0": problem.y0, "args": problem.args, "dt0": problem.levels.h[0]}
-    baths = [term for term in terms if isinstance(term, BathNoise)]
-    for bath in baths:
-        arguments |= {"friction": bath.friction, "temperature": bath.temperature}
+    _, noise = split_terms(problem.terms)
+    for term in noise:
+        if isinstance(term, BathNoise):
+            arguments |= {"friction": term.friction, "temperature": term.temperature}
     for name, value in arguments.items():
         for leaf in jtu.tree_leaves(value):
             if not _is_float(leaf):
@@ -62,20 +64,30 @@ def _lost_arguments(problem: Problem, terms: Terms) -> Iterator[str]:
                 yield f"`{name}` of {size:.2g} counts as infinite"
 
 
-def _lost_on_the_way(problem: Problem, terms: Terms) -> str | None:
+def is_finite_at_start(problem: Problem) -> bool:
+    """Whether the change of the state and `phi` are finite where paths start."""
+    values = jtu.tree_leaves(_first_evaluation(problem, problem.y0))
+    return all(np.all(np.isfinite(_in_float64(x))) for x in values)
+
+
+def _first_evaluation(problem: Problem, y0: Y) -> tuple[list[Y], PyTree[Array]]:
+    """The change of the state by each term, with increments of one, and `phi`, where paths
+    start."""
+    t0, args = problem.t0, problem.args
+    changes = []
+    for term in itertools.chain(*split_terms(problem.terms)):
+        struct = control_struct(term, t0)
+        control = jtu.tree_map(lambda x: jnp.ones(x.shape, x.dtype), struct)
+        changes.append(term.vf_prod(t0, y0, args, control))
+    return changes, problem.phi(t0, y0, args)
+
+
+def _lost_on_the_way(problem: Problem) -> str | None:
     """Names the first operation whose result is out of range, if the change of the state or
     `phi` is not finite at the start; `None` otherwise. Evaluates both one operation after
     another, to look at the results in between."""
-    t0, y0, args = problem.t0, problem.y0, problem.args
-    leaves, treedef = jtu.tree_flatten(y0)
-
-    def first_evaluation(*leaves: Any) -> Any:
-        y = treedef.unflatten(leaves)
-        structs = [control_struct(term, t0) for term in terms]
-        controls = jtu.tree_map(lambda x: jnp.ones(x.shape, x.dtype), structs)
-        changes = [term.vf_prod(t0, y, args, x) for term, x in zip(terms, controls)]
-        return changes, problem.phi(t0, y, args)
-
+    if is_finite_at_start(problem):
+        return None
     losses: list[str] = []
 
     def results_of(eqn: Any, values: list[Any]) -> Sequence[Any]:
@@ -83,14 +95,13 @@ def _lost_on_the_way(problem: Problem, terms: Terms) -> str | None:
         if name in CALLS:
             return results_of_program(eqn.params[CALLS[name]], values, results_of)
         results = results_of_operation(eqn, values, eqn.params)
-        if name in _ARITHMETIC and _is_float(results[0]) and not losses:
+        if name in _ARITHMETIC and _is_float(results[0]):
             losses.extend(_loss(name, values, results[0]))
         return results
 
-    traced = jax.make_jaxpr(first_evaluation)(*leaves)
-    results = results_of_program(traced, leaves, results_of)
-    are_finite = all(np.all(np.isfinite(_in_float64(x))) for x in results)
-    return None if are_finite else next(iter(losses), None)
+    traced = jax.make_jaxpr(ft.partial(_first_evaluation, problem))(problem.y0)
+    results_of_program(traced, jtu.tree_leaves(problem.y0), results_of)
+    return next(iter(losses), None)
 
 
 def _loss(name: str, values: list[Any], result: Any) -> Iterator[str]:

@@ -153,11 +153,12 @@ class _Batches:
         self.size = min(plan.batch_size, plan.num_samples)
         self._key_data = np.asarray(jr.key_data(key))
         self._key_impl = jr.key_impl(key)
-        self._sampler_with_newton = _for_all_processes(plan.sampler)
-        self._sampler = self._sampler_with_newton
+        samplers = [plan.sampler]
         # `simulate_paths` solves the steps before the sampler is called.
         if plan.simulate_paths is None and _has_newton(plan.sampler):
-            self._sampler = _for_all_processes(_by_sweeps_alone(plan.sampler))
+            samplers = [_by_sweeps_alone(plan.sampler), plan.sampler]
+        # The last one is for paths that fail with the first one.
+        self._samplers = [*map(_for_all_processes, samplers)]
         self._simulate_paths = plan.simulate_paths
         self._devices = devices
         self._batch_moments: Any = (
@@ -175,8 +176,8 @@ class _Batches:
         if num_devices == 1:
             on_device = jax.device_put((low_high, num_wanted), self._devices[0])
             low_high, num_wanted = on_device
-        takes_newton = self._sampler is self._sampler_with_newton
-        sampler = self._sampler
+        sampler = self._samplers[0]
+        may_be_repeated = len(self._samplers) > 1
         if self._simulate_paths is not None:
             # Not `jtu.Partial(sampler, paths)`: the function of a `Partial` is static, so
             # with arrays in it, as in the sampler, JAX would compile for each batch.
@@ -196,8 +197,8 @@ class _Batches:
             # The moments are traced if a function closes over traced values.
             check_untraced("`expectation` or `monte_carlo`", moments)
             on_host = jax.device_get(moments)
-            if not takes_newton and np.any(on_host.any_failed):
-                self._sampler = self._sampler_with_newton
+            if may_be_repeated and np.any(on_host.any_failed):
+                self._samplers = self._samplers[-1:]
                 return self.start(first, end)()
             return [
                 jtu.tree_map(lambda x, k=k: x[k], on_host) for k in range(num_devices)

@@ -58,10 +58,10 @@ def _check_interrupted(call, num_paths):
 
 @pytest.mark.parametrize(
     "name",
-    ["may_be_too_long", "cautions", "too_long_steps", "trial_with_finer_level"],
+    ["is_finite_at_start", "cautions", "too_long_steps", "trial_with_finer_level"],
 )
 def test_an_interrupt_after_the_last_sample_keeps_all(name, monkeypatch):
-    if name == "may_be_too_long":
+    if name == "is_finite_at_start":
         # It is asked if most paths fail.
         monkeypatch.setattr(ds.Expectation, "num_failed", 1000)
     monkeypatch.setattr(EXPECTATION, name, _interrupted)

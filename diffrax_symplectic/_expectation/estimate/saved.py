@@ -64,23 +64,15 @@ def write(
 def read(file: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The header and the arrays of a file that `write` wrote. Raises any error for another
     file."""
+    arrays = {}
     with zipfile.ZipFile(file) as archive:
-        # This compares checksums, before anything is taken for an array.
-        arrays = {
-            name.removesuffix(".npy"): _array_in(archive.read(name))
-            for name in archive.namelist()
-        }
+        for name in archive.namelist():
+            # This compares checksums, before anything is taken for an array.
+            content = io.BytesIO(archive.read(name))
+            # Objects are refused, so that no code is executed.
+            array = np.lib.format.read_array(content, allow_pickle=False)
+            arrays[name.removesuffix(".npy")] = array
     return json.loads(str(arrays.pop("header"))), arrays
-
-
-def _array_in(content: bytes) -> np.ndarray:
-    """The array of a NumPy file. Objects in it are refused, so that no code is executed,
-    and so are shapes that its numbers do not fill."""
-    file = io.BytesIO(content)
-    np.lib.format.read_magic(file)
-    shape, in_columns, dtype = np.lib.format.read_array_header_1_0(file)
-    order = "F" if in_columns else "C"
-    return np.frombuffer(file.read(), dtype).reshape(shape, order=order)
 
 
 def contents_of(estimate: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
