@@ -57,8 +57,7 @@ def _check_interrupted(call, num_paths):
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["may_be_too_long", "cautions", "too_long_steps", "trial_with_finer_level"],
+    "name", ["may_be_too_long", "cautions", "too_long_steps", "trial_with_finer_level"]
 )
 def test_an_interrupt_after_the_last_sample_keeps_all(name, monkeypatch):
     if name == "may_be_too_long":
