@@ -1,5 +1,6 @@
 """Problems that several tests share."""
 
+import functools as ft
 from collections.abc import Callable
 
 import diffrax
@@ -57,6 +58,11 @@ H0 = TrigonometricSum("drift")
 noise = TrigonometricSum("noise")
 
 
+# One program in place of one for each operation.
+compiled = ft.partial(jax.jit, static_argnums=(1, 2, 3))
+
+
+@compiled
 def random_problem(key, d: int, m: int, dtype=jnp.float64) -> tuple[PyTree, PyTree]:
     """A random state and random `args` for `H0` and `noise`."""
     kd, kn, ky = jr.split(key, 3)
@@ -121,6 +127,7 @@ def separable_noise(t, p, q, args):
     return jax.vmap(lambda a, v, phi: _potential(t, q, a, v, phi))(a, v, phi)
 
 
+@compiled
 def separable_problem(key, d, m, dtype=jnp.float64):
     ks = jr.split(key, 8)
     draw = lambda i, *shape: jr.normal(ks[i], shape, dtype)
@@ -145,6 +152,7 @@ def moving_noise(t, p, q, args):
     return -jnp.cos(2 * t) * (sigma @ q) + jnp.exp(-t) * (gamma @ p)
 
 
+@compiled
 def additive_problem(key, d, m, dtype=jnp.float64):
     k_drift, k_sigma, k_gamma = jr.split(key, 3)
     y0, args = random_problem(k_drift, d, m, dtype)
@@ -153,6 +161,7 @@ def additive_problem(key, d, m, dtype=jnp.float64):
     return y0, {"drift": args["drift"], "sigma": sigma, "gamma": gamma}
 
 
+@compiled
 def constant_problem(key, d, m, dtype=jnp.float64):
     y0, args = separable_problem(key, d, m, dtype)
     sigma = 0.5 * jr.normal(jr.fold_in(key, 1), (m, d), dtype)

@@ -111,10 +111,7 @@ def test_steps_that_do_not_divide_the_interval_are_refused(dts):
             dict(solvers=[ds.ImplicitMidpoint]),
         ),
         ("`reference` must be a solver", dict(reference="ImplicitMidpoint")),
-        (
-            r"called as `phi\(t, y, args\)`; got .* `\(y\)`",
-            dict(phi=lambda y: y),
-        ),
+        (r"called as `phi\(t, y, args\)`; got .* `\(y\)`", dict(phi=lambda y: y)),
         ("`phi` must return one number", dict(phi=lambda t, y, args: y)),
     ],
 )

@@ -63,12 +63,6 @@ def test_states_are_those_of_diffeqsolve_at_the_saved_times(engine):
         np.testing.assert_allclose(q[i], sol.ys[1], rtol=1e-14, atol=1e-15)
 
 
-def test_terms_of_a_path_are_complete_if_the_terms_had_a_shape():
-    paths = follow(ds.hamiltonian_terms(pendulum, push, ()))
-    sol = diffrax.diffeqsolve(paths.terms(7), ds.StormerVerlet(), 0.0, 1.0, 0.25, ONE)
-    np.testing.assert_allclose(paths.ys[1][7], sol.ys[1][-1], rtol=1e-14)
-
-
 @pytest.mark.parametrize("solver", [ds.SRKw5(), ds.NinomiyaVictoir()])
 @pytest.mark.slow
 def test_weak_methods_have_no_paths_with_the_law_of_the_solution(solver):
@@ -219,10 +213,7 @@ REFUSED = [
     (in_bits, "`stablehlo.bitcast_convert` between numbers of different sizes"),
     (short, "numbers of type `f16`"),
     (ordered, "`stablehlo.sort` of more than 16 numbers"),
-    (
-        table,
-        "`stablehlo.dynamic_slice` with an index per path, among 100 places",
-    ),
+    (table, "`stablehlo.dynamic_slice` with an index per path, among 100 places"),
     (solved, "a call of `lapack_dsyevd"),
 ]
 

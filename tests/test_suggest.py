@@ -11,12 +11,7 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import increment_struct, UnspecifiedPath
 from diffrax_symplectic._solver import LANGEVIN, own_path
-from diffrax_symplectic._suggest import (
-    _shape_code,
-    FOR_FRICTION,
-    ranked,
-    System,
-)
+from diffrax_symplectic._suggest import _shape_code, FOR_FRICTION, ranked, System
 from diffrax_symplectic._terms import (
     brownian_paths,
     motion_numbers,
@@ -122,11 +117,7 @@ def test_with_friction_solvers_that_have_it_are_suggested(want):
     for terms, first, apart in (
         # Stationary positions come first for means, and the order for paths.
         (bath(H0), of_order, splittings),
-        (
-            damped_terms(H0, friction, other, path),
-            other_general,
-            splittings,
-        ),
+        (damped_terms(H0, friction, other, path), other_general, splittings),
         # Constant noise, and a mass that depends on positions.
         (bath(mixed), any_energy, [any_energy]),
     ):

@@ -9,12 +9,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from examples.hard_cases import (
-    double_well,
-    learning,
-    rods,
-    two_body,
-)
+from examples.hard_cases import double_well, learning, rods, two_body
 from examples.hard_cases._ensemble import ensemble, Mean, truncated
 
 

@@ -11,6 +11,8 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation.finer_level import _caveat, _Changes
 
+from ..picard import by_picard
+
 
 def _told(*given, **options):
     """The estimate, and what is said of it by the trial."""
@@ -50,12 +52,10 @@ def test_a_close_encounter_that_steps_miss_is_told_once():
     bars, message = _energy_of_comet(0.9, 30)
     assert bars > 5
     assert f"with steps of {2 * np.pi / 120:.3g}, changes a mean by" in message
-    # Later parts are not tried again, few paths are not worth it, and with three levels
-    # the order is checked.
+    # Later parts are not tried again, and few paths are not worth it.
     few = ds.IndependentPaths(64)
     assert _energy_of_comet(0.9, 30, first=20_000)[1] is None
     assert _energy_of_comet(0.9, 30, sampling=few)[1] is None
-    assert _energy_of_comet(0.9, 30, sampling=few, levels=3)[1] is None
 
 
 def test_a_resolved_encounter_is_not_told():
@@ -82,7 +82,10 @@ DRIVEN = ds.hamiltonian_terms(_oscillator, lambda t, p, q, args: -S * q, ())
 
 @pytest.mark.parametrize(
     "solver, t0, h, num_steps, is_right",
-    [(ds.SRKw5(), 0.0, 1.0, 50, False), (diffrax.Heun(), 0.037, 0.05, 40, True)],
+    [
+        (by_picard(ds.SRKw5()), 0.0, 1.0, 50, False),
+        (diffrax.Heun(), 0.037, 0.05, 40, True),
+    ],
     ids=["discrete increments alone", "any start time and solver"],
 )
 def test_where_levels_cannot_share_their_noise_the_trial_has_paths_of_their_own(

@@ -19,7 +19,6 @@ from ..families import slow_except
 
 
 KEY = jr.key(3)
-Y0 = (jnp.array(0.0), jnp.array(1.0))
 SAMPLINGS = {
     "IndependentPaths": lambda n: ds.IndependentPaths(n, 16),
     "ValueFunctions": lambda n: ds.ValueFunctions(1, n, 16),
@@ -40,13 +39,18 @@ TERMS = ds.hamiltonian_terms(_energy, _force, ds.WeakBrownianPath((), jr.key(0))
 SOLVER = ds.StormerVerlet()
 
 
+def _start(key):
+    """Each path has its own."""
+    return jnp.array(0.0), 1 + jr.normal(key) / 8
+
+
 def _phi(t, y, args):
     return {"q2": y[1] ** 2, "both": (y[0], jnp.stack(y))}
 
 
 def _part(name: str, n: int, first: int = 0, **kwargs) -> ds.Expectation:
     return ds.expectation(
-        _phi, TERMS, SOLVER, 0.0, 1.0, 0.25, Y0, key=KEY, levels=2,
+        _phi, TERMS, SOLVER, 0.0, 1.0, 0.25, _start, key=KEY, levels=2,
         sampling=SAMPLINGS[name](n), first=first, **kwargs,
     )  # fmt: skip
 

@@ -82,14 +82,6 @@ def test_value_functions_leave_the_variance_of_the_start():
     assert abs(estimate.mean[0] - exact(0.01)) < 4 * estimate.std_error[0]
 
 
-def test_parts_of_an_estimate_draw_the_samples_of_the_whole():
-    half = ds.IndependentPaths(100, batch_size=50)
-    first, second = mean(half), mean(half, first=100)
-    whole = mean(ds.IndependentPaths(200, batch_size=50))
-    assert first.merge(second).mean[0] == whole.mean[0]
-    assert first.merge(second).mean[1] == whole.mean[1]
-
-
 @pytest.mark.slow
 def test_the_default_does_not_rely_on_few_paths():
     # An explicit solver: 5.6 in place of 10 s of processor time, nearly all to compile.
@@ -101,23 +93,32 @@ def test_the_default_does_not_rely_on_few_paths():
 ONE, FEW = (jnp.zeros(()), jnp.ones(())), ds.ValueFunctions
 
 
-@pytest.mark.parametrize("engine", ENGINES)
-def test_paths_of_an_ensemble_start_where_they_say_and_may_be_solved_again(engine):
+def several_paths(engine):
     # The start of a path may depend on its own `args`.
-    def start(key, args):
-        return jr.normal(key), jnp.sqrt(args["strength"])
-
-    solver = ds.StormerVerlet()
-    given = TERMS, solver, 0.0, END, 0.25, start, strengths
+    start = lambda key, args: (jr.normal(key), jnp.sqrt(args["strength"]))
+    given = TERMS, ds.StormerVerlet(), 0.0, END, 0.25, start, strengths
     how = dict(key=jr.key(1), num_paths=20, batch_size=8, engine=engine)
-    paths = ds.ensemble(*given, **how, ts=[0.0, END])
+    return ds.ensemble(*given, **how, ts=[0.0, END])
+
+
+@pytest.fixture(scope="module")
+def solved_again():
+    """The starts, ends and strengths of these paths."""
+    paths = several_paths("jax")
 
     def again(number):
         y0, args = paths.start(number)
-        sol = diffrax.diffeqsolve(paths.terms(number), solver, 0.0, END, 0.25, y0, args)
-        return *y0, sol.ys[1][0], args["strength"]
+        given = paths.terms(number), ds.StormerVerlet(), 0.0, END, 0.25, y0, args
+        return *y0, diffrax.diffeqsolve(*given).ys[1][0], args["strength"]
 
-    p, q, ends, strength = jax.jit(jax.vmap(again))(jnp.arange(20))
+    return jax.jit(jax.vmap(again))(jnp.arange(20))
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_paths_of_an_ensemble_start_where_they_say_and_may_be_solved_again(
+    engine, solved_again
+):
+    paths, (p, q, ends, strength) = several_paths(engine), solved_again
     np.testing.assert_allclose(q, np.sqrt(strength), rtol=1e-14)
     np.testing.assert_allclose(paths.ys[0][:, 0], p, rtol=1e-14)
     np.testing.assert_allclose(paths.ys[1], np.stack([q, ends], axis=1), rtol=1e-13)
@@ -146,11 +147,11 @@ def test_a_start_that_is_not_finite_is_a_failed_path(engine):
         return jnp.zeros(()), jnp.log(jr.uniform(key, minval=-1.0))
 
     args = {"strength": jnp.array(1.0)}
-    given = TERMS, ds.SRKw1(), 0.0, END, 0.25, start, args
+    given = TERMS, ds.StormerVerlet(), 0.0, END, 0.25, start, args
     with pytest.warns(UserWarning, match="of 100 paths failed"):
         paths = ds.ensemble(*given, key=jr.key(1), num_paths=100, engine=engine)
-    negative = [not np.isfinite(paths.start(i)[0][1]) for i in range(100)]
-    np.testing.assert_array_equal(paths.failed, negative)
+    starts = jax.jit(jax.vmap(lambda i: paths.start(i)[0][1]))(jnp.arange(100))
+    np.testing.assert_array_equal(paths.failed, ~np.isfinite(starts))
     assert np.all(np.isfinite(paths.ys[1][~paths.failed]))
 
 

@@ -16,8 +16,8 @@ from .fuzz import NUM_CASES
 pytestmark = needs_drjit
 
 # A process takes seconds to start, so several systems share one.
-GROUPS = [range(0, 4)] + [
-    range(begin, min(begin + 9, NUM_CASES)) for begin in range(4, NUM_CASES, 9)
+GROUPS = [range(0, 2)] + [
+    range(begin, min(begin + 9, NUM_CASES)) for begin in range(2, NUM_CASES, 9)
 ]
 # Four steps; units in the last place of the largest number.
 ULPS = 32

@@ -16,14 +16,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._terms import apply, apply_one
 
 from ..picard import by_picard
-from ..problems import (
-    FineSample,
-    Given,
-    H0,
-    noise,
-    random_problem,
-    weak_path,
-)
+from ..problems import FineSample, Given, H0, noise, random_problem, weak_path
 
 
 def test_flows_follow_each_other_in_the_order_of_the_coin():

@@ -18,14 +18,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from ..families import slow_except
-from ..problems import (
-    GENERAL,
-    H0,
-    noise,
-    random_problem,
-    rigid_body_terms,
-    weak_path,
-)
+from ..problems import GENERAL, H0, noise, random_problem, rigid_body_terms, weak_path
 
 
 # Of a solver with one system of equations and of one with several.

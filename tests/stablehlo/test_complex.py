@@ -1,5 +1,7 @@
 """Operations of complex numbers, replayed for many paths, give what JAX gives for each."""
 
+import functools as ft
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ import diffrax_symplectic as ds
 
 from ..drjit_here import needs_drjit
 from ..families import slow_except
+from ..picard import by_picard
 from .replayed import replayed
 from .test_operations import LANES
 
@@ -134,9 +137,9 @@ def test_amplitudes_take_the_steps_that_jax_takes(rate):
     key = jax.random.key(0)
     terms = ds.wave_terms(H0, noise, ds.WeakBrownianPath((), key))
     y0 = ds.to_pair(jnp.array([0.5 + 0.1j, 0.2 + 0.6j, 0.3]))
-    given = terms, ds.ImplicitMidpoint(), 0, 1, 0.1, y0, jnp.asarray(rate)
-    run = lambda engine: ds.ensemble(*given, key=key, num_paths=50, engine=engine)
-    fused, plain = run("drjit"), run("jax")
+    solver, given = ds.ImplicitMidpoint(), (0, 1, 0.1, y0, jnp.asarray(rate))
+    run = ft.partial(ds.ensemble, terms, key=key, num_paths=50)
+    fused, plain = run(solver, *given, engine="drjit"), run(by_picard(solver), *given)
     assert fused.num_failed == 0 and fused.num_stragglers == 0
     for x, y in zip(fused.ys, plain.ys):
         np.testing.assert_allclose(x, y, rtol=0, atol=1e-12)
