@@ -58,8 +58,9 @@ class Kernels:
         arrays = functions.arrays
         key = functions.key
         keys = jax.eval_shape(functions.path_keys, arrays, key, word, word)
-        y = jax.eval_shape(functions.y0, arrays)
-        num_numbers = sum(x.size for x in y)
+        y = eqx.filter_eval_shape(functions.system, arrays).y0
+        y_leaves = jtu.tree_leaves(y)
+        num_numbers = sum(x.size for x in y_leaves)
         if num_numbers > _MOST_NUMBERS_IN_STATE:
             raise ValueError(
                 f'`engine="drjit"` takes states of up to {_MOST_NUMBERS_IN_STATE} '
@@ -73,22 +74,25 @@ class Kernels:
             arrays=arrays,
             keys=keys,
             own_args=functions.own_args,
-            h=jax.ShapeDtypeStruct((), jnp.result_type(*y)),
+            h=jax.ShapeDtypeStruct((), jnp.result_type(*y_leaves)),
             i=jax.ShapeDtypeStruct((), "int32"),
             y=y,
             solver_state=jax.eval_shape(
                 functions.start, arrays, keys, functions.own_args, y
             ),
         )
+
         # For each array of the solver state, whether each path has its own. If all paths
         # start alike, they share the arrays that a step returns unchanged, which then need
         # no registers.
-        self._is_moving = [
-            functions.paths_differ or returned != number
-            for returned, number in zip(
-                self._step.returned.solver_state, self._step.numbers["solver_state"]
-            )
-        ]
+        def is_moving(number: int, returned: int) -> bool:
+            return functions.paths_differ or returned != number
+
+        self._is_moving = jtu.tree_map(
+            is_moving,
+            self._step.numbers["solver_state"],
+            self._step.returned.solver_state,
+        )
         # What is packed to make the keys of paths, and for the steps of all paths: arrays
         # of the system, step size, and the solver state that steps do not change.
         types = self._step.types
@@ -105,15 +109,15 @@ class Kernels:
         self._take_steps = frozen(self._record_steps)
 
     def _solver_state_at_start(
-        self, arrays: list[Array], key, y: list[Array], own_args: list[Array]
-    ) -> list:
-        """The leaves of the solver state before the first step: the state of all paths; or
-        if paths differ, the states of all along a leading axis, which `y` and `own_args`
-        have, too."""
+        self, arrays: list[Array], key, y: PyTree[Array], own_args: list[Array]
+    ) -> PyTree[Array]:
+        """The solver state before the first step: the state of all paths; or if paths
+        differ, the states of all along a leading axis, which `y` and `own_args` have,
+        too."""
 
         def start_of_numbered_path(
-            low: Array, y: list[Array], own_args: list[Array]
-        ) -> list[Array]:
+            low: Array, y: PyTree[Array], own_args: list[Array]
+        ) -> PyTree[Array]:
             keys = self._functions.path_keys(arrays, key, jnp.zeros_like(low), low)
             return self._functions.start(arrays, keys, own_args, y)
 
@@ -146,8 +150,9 @@ class Kernels:
         high = kinds["ui32"](path_numbers >> 32)
         low = kinds["ui32"](path_numbers)
         packed_for_keys = pack(self._types_for_keys, dict(arrays=arrays, key=key))
-        start = jtu.tree_leaves(y0), jtu.tree_leaves(own_args)
-        solver_state = self._compiled_solver_state(arrays, key, *start)
+        solver_state = self._compiled_solver_state(
+            arrays, key, y0, jtu.tree_leaves(own_args)
+        )
         moving, fixed = eqx.partition(solver_state, self._is_moving)
         types = self._step.types
         lanes = Lanes(
@@ -245,12 +250,11 @@ class Kernels:
             def kept(old: Any, new: Any) -> Any:
                 return dr.select(stopped, old, new)
 
-            new_moving = jtu.tree_leaves(
-                eqx.filter(stepped.solver_state, self._is_moving)
-            )
-            new_y = [*map(kept, y, entries_of(stepped.y))]
-            new_solver_state = [*map(kept, solver_state, entries_of(new_moving))]
-            return i + 1, stopped, new_y, new_solver_state
+            new_y = jtu.tree_leaves(stepped.y)
+            new_moving = eqx.filter(stepped.solver_state, self._is_moving)
+            new_state = entries_of(jtu.tree_leaves(new_moving))
+            kept_y = [*map(kept, y, entries_of(new_y))]
+            return i + 1, stopped, kept_y, [*map(kept, solver_state, new_state)]
 
         state_at_start = (first_step, lanes.stopped, lanes.y, lanes.solver_state)
         _, stopped, y, solver_state = dr.while_loop(

@@ -12,19 +12,20 @@ import numpy as np
 from jaxtyping import Array, Bool, PRNGKeyArray, PyTree
 
 from .._compat import is_threefry
+from .._custom_types import Y
 from .._terms import path_keys, with_keys
 
 
 class Stepped(NamedTuple):
     """A path after a step.
 
-    - `y`: the leaves of its state.
-    - `solver_state`: the leaves of the state of its solver.
+    - `y`: its state.
+    - `solver_state`: the state of its solver.
     - `success`: whether the step succeeded.
     """
 
-    y: list[Array]
-    solver_state: list[Array]
+    y: Y
+    solver_state: PyTree[Array]
     success: Bool[Array, ""]
 
 
@@ -69,10 +70,6 @@ class PathFunctions(NamedTuple):
             self.static_treedef.unflatten(self.static),
         )
 
-    def y0(self, arrays: Sequence[Any]) -> list[Array]:
-        """The leaves of the initial state of all paths."""
-        return jtu.tree_leaves(self.system(arrays).y0)
-
     def path_keys(self, arrays: Sequence[Any], key, high, low) -> list[Array]:
         """The random keys in the terms of path number `high * 2^32 + low`."""
         return path_keys(self.system(arrays).terms, sample_key(key, high, low))
@@ -82,15 +79,13 @@ class PathFunctions(NamedTuple):
         arrays: Sequence[Any],
         keys: list[Array],
         own_args: Sequence[Any],
-        y: list[Array],
-    ) -> list:
-        """The leaves of the state of the solver before the first step of a path, from those
-        of its initial state."""
+        y: Y,
+    ) -> PyTree[Array]:
+        """The state of the solver before the first step of a path from `y`."""
         system, terms = self._system_and_terms(arrays, keys, own_args)
-        y0 = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
         # Any size of the first step will do: no solver's initial state depends on it.
-        h = jnp.ones((), jnp.result_type(*y))
-        return jtu.tree_leaves(system.init(terms, 0, h, y0))
+        h = jnp.ones((), jnp.result_type(*jtu.tree_leaves(y)))
+        return system.init(terms, 0, h, y)
 
     def step(
         self,
@@ -99,19 +94,12 @@ class PathFunctions(NamedTuple):
         own_args: Sequence[Any],
         h: Array,
         i: Array,
-        y: list[Array],
-        solver_state: list[Array],
+        y: Y,
+        solver_state: PyTree[Array],
     ) -> Stepped:
-        """A path after step number `i` of size `h`, from the leaves of its state and of the
-        solver's state."""
+        """A path after step number `i` of size `h` from `y`."""
         system, terms = self._system_and_terms(arrays, keys, own_args)
-        # `init` is traced and not run: only the structure of the solver's state is needed.
-        solver_struct = eqx.filter_eval_shape(system.init, terms, 0, h, system.y0)
-        solver_treedef = jtu.tree_structure(solver_struct)
-        y0 = jtu.tree_unflatten(jtu.tree_structure(system.y0), y)
-        state0 = jtu.tree_unflatten(solver_treedef, solver_state)
-        y1, state1, success = system.step(terms, i, h, y0, state0)
-        return Stepped(jtu.tree_leaves(y1), jtu.tree_leaves(state1), success)
+        return Stepped(*system.step(terms, i, h, y, solver_state))
 
     def _system_and_terms(
         self, arrays: Sequence[Any], keys: list[Array], own_args: Sequence[Any]

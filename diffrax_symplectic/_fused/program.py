@@ -31,7 +31,7 @@ class Program:
         the structure of the argument.
     - `numbers`: in the same structure, the numbers of these arrays among all.
     - `returned`: in the structure of the results, for each array the number of the array
-        that is returned unchanged in its place, or `None`.
+        that is returned unchanged in its place, or -1.
     - `constants`: the large constants of the program, as arrays of Dr.Jit.
     """
 
@@ -59,8 +59,9 @@ class Program:
         self._out_tree = lowered.out_tree
         self.types: dict[str, PyTree[ArrayType]] = treedef.unflatten(types)
         self.numbers: dict[str, PyTree[int]] = treedef.unflatten(range(len(types)))
-        self.returned: PyTree = self._out_tree.unflatten(
-            self._replay.returned_arguments
+        returned = self._replay.returned_arguments
+        self.returned: PyTree[int] = self._out_tree.unflatten(
+            [-1 if number is None else number for number in returned]
         )
         self.constants = self._replay.constants()
 
