@@ -14,11 +14,12 @@ PACKAGE = Path(ds.__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
 # Users do not construct these.
 RESULTS = (ds.Comparison, ds.Ensemble, ds.Expectation, ds.Suggestion, ds.Suggestions)
-# What messages quote besides: the first argument of the user's `flow`, a field of an
+# What messages quote besides: the first argument of the user's `flow`, fields of an
 # `Expectation`, an argument that JAX names, the function of Diffrax, libraries, packages.
 OTHERS = {
     "time",
     "error",
+    "std_error",
     "compiler_options",
     "diffeqsolve",
     "llvm",

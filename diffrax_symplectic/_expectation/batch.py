@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from .._compat import is_closure_mismatch
+from .._fused import sample_key
 from .._lapack import lapack_in_turn
 from .._programs import compiled
 from .sampling import Averaged, Samples
@@ -64,12 +65,20 @@ def _moments_on_devices(
     """The moments on all devices, along a leading axis. The first device begins with the
     sample number whose low 32 bits are `low_high[0]`, and the high ones `low_high[1]`. Only
     the first `num_wanted` samples of all devices together count."""
-    moments_on_device = ft.partial(
-        _moments_on_device,
-        key_data=key_data,
-        key_impl=key_impl,
-        samples_per_device=samples_per_device,
-    )
+
+    def moments_on_device(sampler, low_high, num_wanted, device):
+        # The places of the samples among those of all devices.
+        index = device * samples_per_device + jnp.arange(samples_per_device)
+        # The number of each sample. (JAX may have no 64-bit integers.)
+        low = low_high[0] + index.astype(jnp.uint32)
+        # The sum has wrapped around if it is less than one of its terms.
+        has_carry = low < low_high[0]
+        high = low_high[1] + has_carry.astype(jnp.uint32)
+        key = jr.wrap_key_data(jnp.asarray(key_data), impl=key_impl)
+        keys = jax.vmap(ft.partial(sample_key, key))(high, low)
+        # The last batch is cut here: another size would be another program.
+        return _moments_of(lapack_in_turn(sampler)(keys), index < num_wanted)
+
     if mesh.size == 1:
         moments = moments_on_device(sampler, low_high, num_wanted, device=0)
         return jtu.tree_map(lambda x: x[None], moments)
@@ -107,33 +116,8 @@ batch_moments = compiled(_moments_on_devices)
 quick_batch_moments = compiled(_moments_on_devices, quickly=True)
 
 
-def _moments_on_device(
-    sampler: Callable[..., Samples],
-    low_high: UInt32[Array, "2"],
-    num_wanted: Int[Array, ""],
-    device: Any,
-    *,
-    key_data: UInt32[Array, "..."],
-    key_impl: Any,
-    samples_per_device: int,
-) -> BatchMoments:
-    """The moments of the samples of the device with this number. The other arguments are
-    those of `_moments_on_devices`."""
-    # The places of the samples among those of all devices.
-    index = device * samples_per_device + jnp.arange(samples_per_device)
-    # The number of each sample. (JAX may have no 64-bit integers.)
-    low = low_high[0] + index.astype(jnp.uint32)
-    # The sum has wrapped around if it is less than one of its terms.
-    has_carry = low < low_high[0]
-    high = low_high[1] + has_carry.astype(jnp.uint32)
-    key = jr.wrap_key_data(jnp.asarray(key_data), impl=key_impl)
-
-    def sample_key(high: Array, low: Array) -> PRNGKeyArray:
-        return jr.fold_in(jr.fold_in(key, high), low)
-
-    samples = lapack_in_turn(sampler)(jax.vmap(sample_key)(high, low))
-    # The last batch is cut here: another size would be another program.
-    is_wanted = index < num_wanted
+def _moments_of(samples: Samples, is_wanted: Bool[Array, " n"]) -> BatchMoments:
+    """The moments of those samples of one device that are wanted."""
     good = samples.good & is_wanted
     # (levels, samples)
     failures = jnp.where(is_wanted, samples.num_failed, 0)

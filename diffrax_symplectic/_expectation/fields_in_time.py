@@ -69,7 +69,7 @@ def _all_fields(
 
 
 @once_for_each_signature
-def depends_on_time(field: Field, t0: Array, y0: Y) -> bool:
+def depends_on_time(field: Field, t0: Float[Array | np.ndarray, ""], y0: Y) -> bool:
     """Whether a field depends on time: whether its program reads the time. (Its values at
     several times might be equal by chance.)"""
     dependence = Dependence(lambda t: field(t, y0), t0)

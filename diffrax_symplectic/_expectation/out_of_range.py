@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PyTree
+from jaxtyping import PyTree
 
 from .._compat import CALLS, results_of_operation, results_of_program
 from .._custom_types import Y
@@ -70,7 +70,7 @@ def is_finite_at_start(problem: Problem) -> bool:
     return all(np.all(np.isfinite(_in_float64(x))) for x in values)
 
 
-def _first_evaluation(problem: Problem, y0: Y) -> tuple[list[Y], PyTree[Array]]:
+def _first_evaluation(problem: Problem, y0: Y) -> tuple[list[PyTree], PyTree]:
     """The change of the state by each term, with increments of one, and `phi`, where paths
     start."""
     t0, args = problem.t0, problem.args

@@ -74,6 +74,14 @@ def test_what_another_problem_computed_is_not_continued(first):
         part(k=9 * ONE, start=first)
 
 
+def test_parts_of_other_levels_are_refused(first):
+    # Four levels have as many combinations as five.
+    four = dataclasses.replace(first, levels=4)
+    five = dataclasses.replace(part(first=4), levels=5)
+    with pytest.raises(ValueError, match="another structure or other shapes"):
+        four.merge(five)
+
+
 def test_functions_that_compute_the_same_are_the_same(first):
     again = lambda t, p, q, args: p**2 / 2 + args * q**2 / 2
     assert first.merge(part(energy=again, first=4)).num_paths == 8
