@@ -105,8 +105,8 @@ def jumps_within_steps(problem: Problem) -> str | None:
     times = _times_of_jumps(field, problem, steps)
     # Only jumps that another draw of `args` has, too, are at the same time on all paths.
     if problem.args_of is not None and times.size:
-        other_args = problem.with_args(problem.draw_start(jr.key(2)).args).args
-        other_field = all_fields(problem, other_args)
+        _, other_args = problem.draw_start(jr.key(2))
+        other_field = all_fields(problem, problem.with_args(other_args).args)
         other_times = _times_of_jumps(other_field, problem, steps)
         # (jumps of one draw, jumps of the other)
         are_equal = np.abs(times[:, None] - other_times) < steps.far
