@@ -260,22 +260,19 @@ def _refusal(error: BaseException | None) -> ValueError | None:
         cause = cause.__cause__ or cause.__context__
     if cause is None:
         return None
-    return ValueError(
-        f'`engine="drjit"` cannot replay {cause}{_clause_of_origin(cause.location)}. Pass '
-        '`engine="jax"`, or write the function without it.'
-    )
-
-
-def _clause_of_origin(location: str) -> str:
-    """A relative clause that names the function of the user's code from which an operation
-    comes, such as ", which `energy` needs (well.py, line 3)": the first function outside of
-    installed packages. The clause is empty if JAX recorded no such function."""
+    # The user's function from which the operation comes is the first one outside of
+    # installed packages. JAX may have recorded none.
+    origin = ""
     package = str(Path(__file__).parents[1])
-    for source in source_lines(location):
+    for source in source_lines(cause.location):
         if "site-packages" not in source.file and not source.file.startswith(package):
             place = f"({source.file}, line {source.line})"
-            return f", which `{source.function}` needs {place}"
-    return ""
+            origin = f", which `{source.function}` needs {place}"
+            break
+    return ValueError(
+        f'`engine="drjit"` cannot replay {cause}{origin}. Pass `engine="jax"`, or write '
+        "the function without it."
+    )
 
 
 # From the name of an engine to the function that simulates a batch.

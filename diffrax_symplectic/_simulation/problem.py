@@ -338,14 +338,11 @@ class Problem(eqx.Module):
         """How the vectors of samples make PyTrees like `phi`, with an axis of times unless
         the mean is at `t1` only."""
         num_times, _ = self.output_shape
-        struct, _ = self._structs_of_values
-        return Layout.of(struct, None if self.at_end else num_times)
+        return Layout.of(self._struct_of_phi, None if self.at_end else num_times)
 
     @property
-    def _structs_of_values(
-        self,
-    ) -> tuple[PyTree[jax.ShapeDtypeStruct], jax.ShapeDtypeStruct]:
-        return _structs_of_values(self.phi, self.t0, self.y0, self.args)
+    def _struct_of_phi(self) -> PyTree[jax.ShapeDtypeStruct]:
+        return _struct_of_phi(self.phi, self.t0, self.y0, self.args)
 
     @property
     def is_implicit(self) -> bool:
@@ -358,8 +355,8 @@ class Problem(eqx.Module):
     @property
     def dtype_of_values(self) -> Any:
         """The dtype of `values`."""
-        _, struct = self._structs_of_values
-        return struct.dtype
+        leaves = jtu.tree_leaves(self._struct_of_phi)
+        return jnp.result_type(float, *[leaf.dtype for leaf in leaves])
 
     @property
     def dtype(self) -> Any:
@@ -374,24 +371,18 @@ class Problem(eqx.Module):
     @property
     def output_shape(self) -> tuple[int, int]:
         """The number `S` of times at which to average, and `m` of components of `phi`."""
-        _, struct = self._structs_of_values
-        return self.levels.saved_steps.shape[1], struct.size
+        return self.levels.saved_steps.shape[1], Layout.of(self._struct_of_phi).size
 
 
 @once_for_each_signature
-def _structs_of_values(
+def _struct_of_phi(
     phi: Callable[..., PyTree[ArrayLike]],
     t0: Float[Array | np.ndarray, ""],
     y0: Y,
     args: Args,
-) -> tuple[PyTree[jax.ShapeDtypeStruct], jax.ShapeDtypeStruct]:
-    """The shapes and dtypes of `phi`, and of all its numbers as one vector."""
-
-    def as_tree_and_vector() -> tuple[PyTree[ArrayLike], Array]:
-        value = phi(t0, y0, args)
-        return value, real_vector(value)
-
-    return jax.eval_shape(as_tree_and_vector)
+) -> PyTree[jax.ShapeDtypeStruct]:
+    """The shapes and dtypes of `phi`."""
+    return jax.eval_shape(lambda: phi(t0, y0, args))
 
 
 def _order_of(solver: diffrax.AbstractSolver, terms: PyTree) -> int | float:

@@ -21,37 +21,37 @@ def test_polynomials_are_orthonormal_and_fits_nested():
     B = np.asarray(jax.jit(jax.vmap(lambda z: jnp.stack(hermite(z, 4))))(grid))
     assert B.shape[1] == len(exponents(2, 4)) == 15
     np.testing.assert_allclose((B.T * weights) @ B, np.eye(15), atol=1e-12)
-    values = np.random.default_rng(0).normal(size=(144, 2, 1))
-    values[:, 1] = B[:, :6] @ np.ones((6, 1))
+    values = np.random.default_rng(0).normal(size=(144, 2))
+    values[:, 1] = B[:, :6] @ np.ones(6)
     fit = jax.jit(least_squares, static_argnums=2)
     got = fit(B, values, (3, 6))
-    expected = np.linalg.lstsq(B[:, :3], values[:, 0], rcond=None)[0]
+    expected = np.linalg.lstsq(B[:, :3], values, rcond=None)[0]
     np.testing.assert_allclose(got[:3, 0], expected, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(got[:, 1, 0], [1] * 6 + [0] * 9, atol=1e-9)
+    np.testing.assert_allclose(got[:, 1, 1], [1] * 6 + [0] * 9, atol=1e-9)
     # Of two columns that are one, none explodes.
     twice = np.concatenate([B[:, :3], B[:, 2:3]], axis=1)
     got = fit(twice, values[:, 1:], (4,))
-    smallest = np.linalg.lstsq(twice, values[:, 1], rcond=None)[0]
+    smallest = np.linalg.lstsq(twice, values[:, 1:], rcond=None)[0]
     np.testing.assert_allclose(got[:, 0], smallest, atol=1e-3)
 
 
 def test_points_whose_values_overflow_are_left_out_of_a_fit():
-    basis, good = Hermite(2, (2,)), jnp.ones(200, bool)
+    basis, good = Hermite(2, 2), jnp.ones(200, bool)
     points = np.random.default_rng(0).normal(size=(200, 2))
-    values = (points[:, 0] ** 2 - points[:, 1])[:, None, None, None]
+    values = (points[:, 0] ** 2 - points[:, 1])[:, None, None]
     spoiled = values.copy()
     spoiled[:5], spoiled[5] = np.inf, np.nan
 
     @jax.jit
     def fitted(values):
         frame = CovarianceFrame.of(points, good, jnp.ones(2))
-        return basis.least_squares_fit(values, frame, points, good)
+        return basis.least_squares_fits(values, frame, points, good, [2])
 
     np.testing.assert_allclose(fitted(spoiled), fitted(values), atol=1e-9)
 
 
 def test_a_grid_interpolates_with_degree_five_and_is_zero_beyond():
-    grid, axis = Grid(2, (12,)), np.linspace(-1, 1, 12)
+    grid, axis = Grid(2, 12), np.linspace(-1, 1, 12)
     fn = lambda x, y: (x**5 - x) * (y**5 + y**2)
     c = jnp.asarray(fn(*np.meshgrid(axis, axis, indexing="ij"))).reshape(-1, 1)
     # Two points at least are to lie on either side.
@@ -63,7 +63,7 @@ def test_a_grid_interpolates_with_degree_five_and_is_zero_beyond():
 
 
 def test_what_a_grid_corrects_is_exact_at_its_points_and_falls_to_zero_at_its_edge():
-    grid, good = Grid(2, (16,)), jnp.ones(1000, bool)
+    grid, good = Grid(2, 16), jnp.ones(1000, bool)
     points = np.random.default_rng(0).normal(size=(1000, 2))
     axis = np.linspace(-1, 1, 16)
     fn = lambda y: jnp.exp(y[0] - y[1] / 2)
@@ -72,10 +72,10 @@ def test_what_a_grid_corrects_is_exact_at_its_points_and_falls_to_zero_at_its_ed
     @jax.jit
     def fitted(points):
         frame = grid.frame(points, good, jnp.ones(2))
-        value = lambda y: fn(y)[None, None, None]
+        value = lambda y: fn(y)[None, None]
         c = grid.coefficients(value, frame, points, good, None)
         nodes = frame.states(inner)
-        at_nodes = jax.vmap(lambda y: grid.value_at(frame, y, c)[0, 0, 0])(nodes)
+        at_nodes = jax.vmap(lambda y: grid.value_at(frame, y, c)[0, 0])(nodes)
         return c[-(16**2) :].reshape(16, 16), at_nodes, jax.vmap(fn)(nodes)
 
     correction, got, expected = fitted(points)
@@ -92,7 +92,7 @@ def test_a_grid_is_even_where_most_states_are_and_holds_all(heavy):
 
     @jax.jit
     def there_and_back(points):
-        grid = Grid(2, (64,)).frame(points, jnp.ones(2000, bool), jnp.ones(2))
+        grid = Grid(2, 64).frame(points, jnp.ones(2000, bool), jnp.ones(2))
         x = grid.coordinates(points)
         return x, grid.states(x)
 

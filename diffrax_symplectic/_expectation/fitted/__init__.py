@@ -8,8 +8,8 @@
 - `controlled_paths`: paths, and their control variates.
 - `mixture`: the laws of the noise of paths, by which rare ones are common.
 
-Axes of arrays, beside those of `_simulation/problem.py`: `C` candidates, among which trials
-choose, `P` polynomials, `K` outcomes of a step. Of random variables there are `n` as well.
+Axes of arrays, beside those of `_simulation/problem.py`: `P` polynomials, `K` outcomes of a
+step. Of random variables there are `n` as well.
 """
 
 from .basis_choice import suits_grid

@@ -3,7 +3,7 @@
 
 import abc
 import functools as ft
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, TypeAlias
 
 import equinox as eqx
@@ -39,7 +39,7 @@ _QUADRATIC_GRADIENTS = 2**13
 
 # Maps a state to the values that functions are fitted to, or a state and a random key to
 # estimates of them.
-Target: TypeAlias = Callable[..., Float[Array, "C S m"]]
+Target: TypeAlias = Callable[..., Float[Array, "S m"]]
 
 
 class CovarianceFrame(eqx.Module):
@@ -103,20 +103,29 @@ def inverse_or_zero(scales: Float[Array, " d"]) -> Float[Array, " d"]:
 
 
 class AbstractBasis(eqx.Module):
-    """Functions of `d` coordinates, with several candidates (such as degrees) to choose
-    from. A function is a linear combination with `size` coefficients. The trailing axes of
-    the coefficients are candidates, times at which to average, and components of `phi`."""
+    """Functions of `d` coordinates. A function is a linear combination with `size`
+    coefficients. The trailing axes of the coefficients are times at which to average, and
+    components of `phi`."""
 
-    # What a candidate is, for messages.
-    candidate_name: eqx.AbstractClassVar[str]
     d: eqx.AbstractVar[int]
-    candidates: eqx.AbstractVar[tuple[int, ...]]
-    # The number of coefficients of a function.
-    size: eqx.AbstractVar[int]
-    # The number of pilot paths that a fit needs.
-    num_pilots: eqx.AbstractVar[int]
-    # The number of states at which a fit evaluates its target.
-    num_sites: eqx.AbstractVar[int]
+    # Such as a degree, and what it is, for messages.
+    resolution: eqx.AbstractVar[int]
+    resolution_name: eqx.AbstractClassVar[str]
+
+    @property
+    @abc.abstractmethod
+    def size(self) -> int:
+        """The number of coefficients of a function."""
+
+    @property
+    @abc.abstractmethod
+    def num_pilots(self) -> int:
+        """The number of pilot paths that a fit needs."""
+
+    @property
+    @abc.abstractmethod
+    def num_sites(self) -> int:
+        """The number of states at which a fit evaluates its target."""
 
     @abc.abstractmethod
     def frame(
@@ -136,29 +145,29 @@ class AbstractBasis(eqx.Module):
         states: Float[Array, "n d"],
         good: Bool[Array, " n"],
         keys: Key[Array, " n"],
-    ) -> Float[Array, "size C S m"]:
+    ) -> Float[Array, "size S m"]:
         """The coefficients of the functions fitted to `target`, at or near the pilot's
         `states`, of which the `good` ones did not fail. A basis calls `target(state)`, or
         `target(state, key)` with the key of the pilot's path for a random estimate, which
-        costs less. (`C` candidates, `S` times and `m` numbers of `phi`.)"""
+        costs less. (`S` times and `m` numbers of `phi`.)"""
 
     @abc.abstractmethod
     def value_at(
-        self, frame: Any, y: Float[Array, " d"], c: Float[Array, "size *C S m"]
-    ) -> Float[Array, "*C S m"]:
+        self, frame: Any, y: Float[Array, " d"], c: Float[Array, "size S m"]
+    ) -> Float[Array, "S m"]:
         """The function with these coefficients at a state."""
 
 
 class Hermite(AbstractBasis):
-    """Products of Hermite polynomials, with a candidate for each total degree."""
+    """Products of Hermite polynomials up to a total degree, the `resolution`."""
 
-    candidate_name: ClassVar[str] = "degree"
     d: int
-    candidates: tuple[int, ...]
+    resolution: int
+    resolution_name: ClassVar[str] = "degree"
 
     @property
     def size(self):
-        return num_polynomials(self.d, max(self.candidates))
+        return num_polynomials(self.d, self.resolution)
 
     @property
     def num_pilots(self):
@@ -174,51 +183,54 @@ class Hermite(AbstractBasis):
     def coefficients(self, target, frame, states, good, keys):
         points = frame.perturbed(states)
         values = jax.vmap(target)(points)
-        return self.least_squares_fit(values, frame, points, good)
+        c = self.least_squares_fits(values, frame, points, good, [self.resolution])
+        return c[:, 0]
 
-    def least_squares_fit(
+    def least_squares_fits(
         self,
-        values: Float[Array, "n C S m"],
+        values: Float[Array, "n S m"],
         frame: CovarianceFrame,
         points: Float[Array, "n d"],
         good: Bool[Array, " n"],
-    ) -> Float[Array, "size C S m"]:
-        """The least-squares fit to the values at the good points."""
+        degrees: Sequence[int],
+    ) -> Float[Array, "size degrees S m"]:
+        """The least-squares fits of each of these degrees to the values at the good
+        points."""
         B = self.polynomials(frame, points)
-        # (n, C, S * m)
-        flat_values = values.reshape(*values.shape[:2], -1)
+        # (n, S * m)
+        flat_values = values.reshape(len(values), -1)
         # Rows of zeros have no part in a fit.
-        is_finite = jnp.isfinite(flat_values).all(axis=(1, 2))
+        is_finite = jnp.isfinite(flat_values).all(axis=1)
         is_used = good & jnp.isfinite(B).all(axis=1) & is_finite
         B = jnp.where(is_used[:, None], B, 0)
-        flat_values = jnp.where(is_used[:, None, None], flat_values, 0)
-        sizes = [num_polynomials(self.d, degree) for degree in self.candidates]
+        flat_values = jnp.where(is_used[:, None], flat_values, 0)
+        sizes = [num_polynomials(self.d, degree) for degree in degrees]
         c = least_squares(B, flat_values, sizes)
-        return c.reshape(-1, *values.shape[1:])
+        return c.reshape(*c.shape[:2], *values.shape[1:])
 
     def polynomials(
         self, frame: CovarianceFrame, points: Float[Array, "n d"]
     ) -> Float[Array, "n size"]:
         """The values of all polynomials at points."""
-        of_all_points = jax.vmap(ft.partial(hermite, degree=max(self.candidates)))
+        of_all_points = jax.vmap(ft.partial(hermite, degree=self.resolution))
         return jnp.stack(of_all_points(frame.coordinates(points)), axis=1)
 
     def value_at(self, frame, y, c):
         # As a sum of products this compiles to one loop without temporary arrays.
-        polynomials = hermite(frame.coordinates(y), max(self.candidates))
+        polynomials = hermite(frame.coordinates(y), self.resolution)
         return ft.reduce(jnp.add, map(jnp.multiply, polynomials, c))
 
 
 class Quadratic(AbstractBasis):
-    """Linear and quadratic functions, with a candidate for each degree. The coefficients
+    """Linear functions, or for a `resolution` of 2 quadratic functions. The coefficients
     are the first and then the second derivatives, averaged over the pilot's states. For
     Gaussian states this is the least-squares fit, by Stein's lemma. Coordinates are states
     minus their mean, divided by their scales, which are zero for components that do not
     move."""
 
-    candidate_name: ClassVar[str] = "degree"
     d: int
-    candidates: tuple[int, ...]
+    resolution: int
+    resolution_name: ClassVar[str] = "degree"
 
     @property
     def size(self):
@@ -253,21 +265,19 @@ class Quadratic(AbstractBasis):
 
             # The gradient comes along with its derivative, without another evaluation.
             hessian_and_gradient = jax.jacfwd(gradient_twice, has_aux=True)
-            # (C, S, m, d, d) and (C, S, m, d)
+            # (S, m, d, d) and (S, m, d)
             hessian, gradient = hessian_and_gradient(jnp.zeros_like(y))
             flat_hessian = hessian.reshape(*gradient.shape[:-1], -1)
-            # (d + d**2, C, S, m)
+            # (d + d**2, S, m)
             return jnp.moveaxis(jnp.concatenate([gradient, flat_hessian], -1), -1, 0)
 
         # One path after another, since a Hessian needs the memory of `d` gradients.
         of_paths = lax.map(derivatives, (keys, states))
         weights = equal_weights(good, of_paths.dtype)
         mean = tensordot(weights, jnp.where(jnp.isfinite(of_paths), of_paths, 0), 1)
-        # A candidate of degree 1 has no second derivatives. Orders and degrees are arrays
-        # of shape (d + d**2, 1, 1, 1) and (C, 1, 1).
-        order = np.repeat([1, 2], [self.d, self.d**2])[:, None, None, None]
-        degrees = np.array(self.candidates)[:, None, None]
-        return jnp.where(order <= degrees, mean, 0)
+        # Linear functions have no second derivatives.
+        order = np.repeat([1, 2], [self.d, self.d**2])[:, None, None]
+        return jnp.where(order <= self.resolution, mean, 0)
 
     def value_at(self, frame, y, c):
         mean, scales = frame

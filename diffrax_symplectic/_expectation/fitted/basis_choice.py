@@ -28,8 +28,8 @@ _MOST_POLYNOMIALS = 130
 # The highest degree by default. (In one dimension there are few polynomials: the most that
 # are allowed would be of degree 129.)
 _HIGHEST_DEGREE = 8
-# Degrees up to this one are tried however long they take.
-_ALWAYS_TRIED_UP_TO = 2
+# This degree is allowed however long it takes.
+_ALWAYS_ALLOWED_DEGREE = 2
 # The most bytes that a fit may take, so that it fits into machines of 8 GiB.
 _MOST_MEMORY = 4 * 2**30
 # A fit that computes at most this many numbers takes less time than compiling its program.
@@ -58,9 +58,9 @@ class ChosenBasis(NamedTuple):
 
 def chosen_basis(problem: Problem, degree: int | None) -> ChosenBasis:
     """The basis for polynomials of this degree; or for `None` a grid if it fits into memory
-    and time, and otherwise polynomials of several degrees to try. Raises a `ValueError` if
-    the fit needs too much memory, or for random variables without finitely many
-    outcomes."""
+    and time, and otherwise polynomials of the highest degree that does. Raises a
+    `ValueError` if the fit needs too much memory, or for random variables without finitely
+    many outcomes."""
     nodes, _ = Noise.of(problem, problem.level(0)).weighted_nodes()
     num_nodes = len(nodes)
     total_steps = int(np.sum(problem.levels.num_steps))
@@ -77,7 +77,7 @@ def chosen_basis(problem: Problem, degree: int | None) -> ChosenBasis:
 
     if degree is None and d <= _MOST_DIMENSIONS_OF_GRID:
         for size in _SIZES_OF_GRID:
-            grid = Grid(d, (size,))
+            grid = Grid(d, size)
             # The loop over steps backward holds the coefficients twice.
             memory = 2 * problem.dtype.itemsize * grid.size * num_functions
             num_ends = size**d * num_nodes
@@ -86,38 +86,29 @@ def chosen_basis(problem: Problem, degree: int | None) -> ChosenBasis:
             if memory <= _MOST_MEMORY and fits_into_step and is_quick:
                 return with_cost(grid)
 
+    if degree is not None:
+        degree = whole_number("degree", degree, 0)
+    else:
+        # The highest that has few polynomials and does not take too long.
+        degree = _ALWAYS_ALLOWED_DEGREE
+        for higher in range(degree + 1, _HIGHEST_DEGREE + 1):
+            num_ends = Hermite(d, higher).num_sites * num_nodes
+            is_quick = num_ends * total_steps <= _MOST_ENDS
+            if is_quick and num_polynomials(d, higher) <= _MOST_POLYNOMIALS:
+                degree = higher
     # `Quadratic` averages derivatives in place of least squares, which would cost more with
     # so many polynomials.
-    has_many_polynomials = num_polynomials(d, 2) > _MOST_POLYNOMIALS
-    if degree is not None:
-        degrees = (whole_number("degree", degree, 0),)
-    elif has_many_polynomials:
-        degrees = (1, 2)
-    else:
-        # The highest degree that has few polynomials and does not take too long, and all
-        # even degrees below it.
-        *lower, highest = [
-            degree
-            for degree in range(1, _HIGHEST_DEGREE + 1)
-            if num_polynomials(d, degree) <= _MOST_POLYNOMIALS
-            and (
-                degree <= _ALWAYS_TRIED_UP_TO
-                or Hermite(d, (degree,)).num_sites * num_nodes * total_steps
-                <= _MOST_ENDS
-            )
-        ]
-        degrees = (*[degree for degree in lower if degree % 2 == 0], highest)
-    if has_many_polynomials and max(degrees) <= 2:
-        return with_cost(Quadratic(d, degrees))
+    if degree <= 2 and num_polynomials(d, 2) > _MOST_POLYNOMIALS:
+        return with_cost(Quadratic(d, degree))
 
-    basis = Hermite(d, degrees)
+    basis = Hermite(d, degree)
     # The fit holds the polynomials at all points of one step, and the coefficients of all
     # functions.
-    num_rows = basis.num_pilots + len(degrees) * num_functions
-    memory = problem.dtype.itemsize * basis.size * num_rows
+    num_numbers = basis.size * (basis.num_pilots + num_functions)
+    memory = problem.dtype.itemsize * num_numbers
     if memory > _MOST_MEMORY:
         raise ValueError(
-            f"`degree={max(degrees)}` has {basis.size:,} polynomials in {d} dimensions, "
+            f"`degree={degree}` has {basis.size:,} polynomials in {d} dimensions, "
             f"and its fit needs {memory / 2**30:,.0f} GiB. Pass a smaller `degree`."
         )
     return with_cost(basis)

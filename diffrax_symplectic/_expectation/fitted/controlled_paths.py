@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, Float, Int, Key, PRNGKeyArray, PyTree
+from jaxtyping import Array, Bool, Float, Key, PyTree
 
 from ..._custom_types import Args, Y
 from ..._simulation import (
@@ -28,16 +28,14 @@ from .noise import Noise
 def controlled_paths(
     problem: Problem,
     functions: FittedFunctions,
-    choice: Int[Array, "S m"],
+    is_used: Bool[Array, "S m"],
     mixture: Mixture,
     keys: Key[Array, " n"],
 ) -> Samples:
     """A sample is the value of a path minus its control variate, by `functions` with a
     leading axis of levels. It is weighted by the likelihood ratio of the path, since paths
-    draw their noise by the laws of the `mixture`, not all by their own. `choice` is the
-    number of the candidate for each time and component, counted from 1; or 0 for no control
-    variate."""
-    functions = functions.of_candidates(jnp.maximum(choice - 1, 0))
+    draw their noise by the laws of the `mixture`, not all by their own. `is_used` says for
+    which times and components there is a control variate."""
     starts = jax.vmap(problem.draw_start)(keys)
     laws = jax.vmap(mixture.draw_law)(keys)
 
@@ -47,14 +45,7 @@ def controlled_paths(
         cuts = jnp.asarray(mixture.cuts)[level.index]
         log_ratios_of_laws = jnp.asarray(mixture.log_ratios)[level.index]
 
-        def step_of_path(
-            i: Any,
-            y: Y,
-            solver_state: PyTree[Array],
-            args: Args,
-            key: PRNGKeyArray,
-            law: Int[Array, ""],
-        ) -> tuple:
+        def step_of_path(i, y, solver_state, args, key, law):
             x, has_outcome = noise.draw(key, i, cuts[law])
             second_derivatives = jtu.tree_map(
                 lambda x: x[i], value_functions.second_derivatives
@@ -76,7 +67,7 @@ def controlled_paths(
             )(paths.y, paths.solver_state, paths.args, keys, laws)
             control, log_ratios = paths.control
             # A failed path has no value, but its control must be finite.
-            has_control = mask_like(success, control_of_step) & (choice > 0)
+            has_control = mask_like(success, control_of_step) & is_used
             control += jnp.where(has_control, control_of_step, 0)
             log_ratios += log_ratios_of_step
             return paths.after_step(

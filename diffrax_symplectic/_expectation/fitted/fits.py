@@ -29,15 +29,15 @@ _STATES_FOR_SECOND = 32
 
 class FittedFunctions(eqx.Module):
     """The value functions of a level, one after each step, for each time at which to
-    average (`S`) and each component of `phi` (`m`); and for each candidate (`C`), until one
-    is chosen. For several levels there is another leading axis.
+    average (`S`) and each component of `phi` (`m`). For several levels there is another
+    leading axis.
 
     - `frames`: the coordinates of the basis, with a leading axis of steps.
     - `coefficients`: the coefficients of the `size` functions of the basis, with axes for
-        steps, `size`, `C`, `S` and `m`.
+        steps, `size`, `S` and `m`.
     - `second_derivatives`: those along the noise, from `Noise.mean_second_derivatives`,
-        with axes for steps, twice the random variables, `C`, `S` and `m`; `None` if there
-        are few outcomes.
+        with axes for steps, twice the random variables, `S` and `m`; `None` if there are
+        few outcomes.
     """
 
     frames: PyTree[Array]
@@ -45,24 +45,10 @@ class FittedFunctions(eqx.Module):
     second_derivatives: Float[Array, "..."] | None
     basis: AbstractBasis = eqx.field(static=True)
 
-    def __call__(self, i: Any, y: Y) -> Float[Array, "*C S m"]:
+    def __call__(self, i: Any, y: Y) -> Float[Array, "S m"]:
         """Their values at a state after step `i`."""
         frame = jtu.tree_map(lambda x: x[i], self.frames)
         return self.basis.value_at(frame, ravel(y), self.coefficients[i])
-
-    def of_candidates(self, best: Int[Array, "S m"]) -> "FittedFunctions":
-        """The functions of these candidates, one for each time and component."""
-
-        def take(x: Float[Array, "... C S m"]) -> Float[Array, "... S m"]:
-            index = best.reshape(*[1] * (x.ndim - 2), *best.shape)
-            return jnp.take_along_axis(x, index, -3).squeeze(-3)
-
-        return dataclasses.replace(
-            self,
-            coefficients=take(self.coefficients),
-            # `None` has no leaves.
-            second_derivatives=jtu.tree_map(take, self.second_derivatives),
-        )
 
 
 def room_for_steps(problem: Problem) -> int:
@@ -90,7 +76,20 @@ def fit(
     num_steps = noise.level.num_steps
     keys = jr.split(jr.fold_in(key, index), basis.num_pilots)
     starts, states, good = _run_pilot(noise, keys, most_steps)
-    scales = _scales(problem, starts, states, good, num_steps)
+
+    # How far each component moves: the root of the mean squared distance from the start
+    # over all steps of good paths. It is zero for components that do not move.
+    start = ravel(problem.y0)
+    if problem.y0_of is not None:
+        start = jnp.mean(starts, axis=0)
+    # (steps, paths, d)
+    distances = jnp.where(good[:, None], jnp.abs(states - start), 0)
+    # Dividing by the largest value first avoids underflow of squares in single precision.
+    largest = jnp.max(distances, axis=(0, 1))
+    scaled = distances / jnp.where(largest > 0, largest, 1)
+    weights = equal_weights(good, start.dtype)
+    mean_square = jnp.einsum("n,ind->d", weights, scaled**2) / num_steps
+    scales = largest * jnp.sqrt(mean_square)
 
     def frame_after(i: Any) -> PyTree[Array]:
         return basis.frame(states[i], good, scales)
@@ -108,35 +107,30 @@ def fit(
             coefficients=put_step(fitted.coefficients, coefficients),
         )
 
-    def zeros_for_all_steps(of_step: jax.ShapeDtypeStruct) -> Array:
-        return jnp.zeros((most_steps, *of_step.shape), of_step.dtype)
-
-    shape = (basis.size, len(basis.candidates), *problem.output_shape)
-    unfitted = FittedFunctions(
-        frames=jtu.tree_map(zeros_for_all_steps, jax.eval_shape(frame_after, 0)),
-        coefficients=jnp.zeros((most_steps, *shape), problem.dtype),
-        second_derivatives=None,
-        basis=basis,
+    struct_of_coefficients = jax.ShapeDtypeStruct(
+        (basis.size, *problem.output_shape), problem.dtype
     )
+    frames, coefficients = jtu.tree_map(
+        lambda of_step: jnp.zeros((most_steps, *of_step.shape), of_step.dtype),
+        (jax.eval_shape(frame_after, 0), struct_of_coefficients),
+    )
+    unfitted = FittedFunctions(frames, coefficients, None, basis)
     fitted = lax.fori_loop(0, num_steps, fit_step, unfitted)
 
     # No fit reads second derivatives, so they are computed once, at the end.
     _, unravel = jfu.ravel_pytree(problem.y0)
 
-    def second_derivatives_of_step(
-        step_and_states: tuple[Array, Float[Array, "n d"]],
-    ) -> Array | None:
-        i, states_before = step_and_states
-        ys = jax.vmap(unravel)(states_before)
+    def second_derivatives_of_step(step_and_states):
+        i, states = step_and_states
+        ys = jax.vmap(unravel)(states)
         return noise.mean_second_derivatives(i, ys, ft.partial(fitted, i))
 
     # The states before each step are those after the step before: (steps, paths, d).
     states_before = jnp.concatenate([starts[None], states[:-1]])
-    steps_and_states = (
-        jnp.arange(most_steps),
-        states_before[:, :_STATES_FOR_SECOND],
+    few_states = states_before[:, :_STATES_FOR_SECOND]
+    second_derivatives = lax.map(
+        second_derivatives_of_step, (jnp.arange(most_steps), few_states)
     )
-    second_derivatives = lax.map(second_derivatives_of_step, steps_and_states)
     functions = dataclasses.replace(fitted, second_derivatives=second_derivatives)
     return jtu.tree_map(lambda x: x[None], functions), jnp.sum(~good)
 
@@ -163,7 +157,7 @@ def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
             number = len(fitted.coefficients) + i
             cuts = cuts_of([law.probabilities for law in noise.laws])
             variables, _ = noise.draw(key, number, cuts)
-        # (C, S, m), and `phi` (m).
+        # (S, m), and `phi` (m).
         mean = noise.mean(next_step, y, ft.partial(fitted, next_step), variables)
         phi = problem.values(problem.t0 + (i + 1) * level.h, y).astype(mean.dtype)
         # Which of the times at which to average are the end of this step, or later.
@@ -189,9 +183,7 @@ def _run_pilot(
         [np.full(len(x.values), 1 / len(x.values)) for x in noise.laws]
     )
 
-    def step_one(
-        i: Any, y: Y, args: PyTree[Array], key: PRNGKeyArray
-    ) -> tuple[Y, Bool[Array, ""]]:
+    def step_one(i, y, args, key):
         x, _ = noise.draw(key, i, equal_cuts)
         noise_of_path = noise.with_args(args)
         # Solvers start anew in each step, which is good enough for a fit.
@@ -201,8 +193,7 @@ def _run_pilot(
 
     def step_all(i: Any, carry: tuple[PathStates, Array]) -> tuple[PathStates, Array]:
         paths, states = carry
-        vectorized_step = jax.vmap(ft.partial(step_one, i))
-        y, success = vectorized_step(paths.y, paths.args, keys)
+        y, success = jax.vmap(ft.partial(step_one, i))(paths.y, paths.args, keys)
         paths = paths.after_step(problem, y, None, success)
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
@@ -211,28 +202,6 @@ def _run_pilot(
     )
     starts = jax.vmap(ravel)(paths.y)
     states = jnp.broadcast_to(starts, (most_steps, *starts.shape))
-    carry = paths, states
-    paths, states = lax.fori_loop(0, noise.level.num_steps, step_all, carry)
+    num_steps = noise.level.num_steps
+    paths, states = lax.fori_loop(0, num_steps, step_all, (paths, states))
     return starts, states, ~paths.failed
-
-
-def _scales(
-    problem: Problem,
-    starts: Float[Array, "paths d"],
-    states: Float[Array, "steps paths d"],
-    good: Bool[Array, " paths"],
-    num_steps: Any,
-) -> Float[Array, " d"]:
-    """How far each component moves: the root of the mean squared distance from the start
-    over all steps of good paths. Zero for components that do not move."""
-    start = ravel(problem.y0)
-    if problem.y0_of is not None:
-        start = jnp.mean(starts, axis=0)
-    # (steps, paths, d)
-    distances = jnp.where(good[:, None], jnp.abs(states - start), 0)
-    # Dividing by the largest value first avoids underflow of squares in single precision.
-    largest = jnp.max(distances, axis=(0, 1))
-    scaled = distances / jnp.where(largest > 0, largest, 1)
-    weights = equal_weights(good, start.dtype)
-    mean_square = jnp.einsum("n,ind->d", weights, scaled**2) / num_steps
-    return largest * jnp.sqrt(mean_square)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from ..._products import tensordot
 from .bases import AbstractBasis, CovarianceFrame, Hermite
@@ -58,19 +58,62 @@ class StretchedFrame(eqx.Module):
     factor: Float[Array, " d"]
     edge: Float[Array, " d"]
 
-    @staticmethod
-    def of(
-        inner: CovarianceFrame,
-        z: Float[Array, "n d"],
-        good: Bool[Array, " n"],
-        num_for_quartiles: int,
-    ) -> "StretchedFrame":
-        """The coordinates for paths at `z`, of which some are `good`. A few of them suffice
-        for the quartiles."""
+    def coordinates(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
+        """The coordinates of states."""
+        scaled = self.factor * (self.inner.coordinates(y) - self.median)
+        return _compressed(_compressed(scaled)) / self.edge
+
+    def states(self, x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
+        """The states with these coordinates."""
+        unscaled = _expanded(_expanded(self.edge * x))
+        return self.inner.states(self.median + unscaled / self.factor)
+
+
+def _compressed(x: Array) -> Array:
+    """An odd function with slope 1 at zero, which grows like the square root. (It takes a
+    quarter of the time of a logarithm.)"""
+    return x / jnp.sqrt(jnp.sqrt(1 + x**2))
+
+
+def _expanded(x: Array) -> Array:
+    """The inverse of `_compressed`."""
+    return x * jnp.sqrt(x**2 / 2 + jnp.sqrt(1 + x**4 / 4))
+
+
+class Grid(AbstractBasis):
+    """A polynomial plus a correction on a grid, interpolated by polynomials of degree 5
+    through the 6 nearest points along each axis. The `resolution` is the number of points
+    along an axis. The correction falls to zero towards the edge of the grid; beyond it only
+    the polynomial remains, whose degree is the one that fits best near the edge."""
+
+    d: int
+    resolution: int
+    resolution_name: ClassVar[str] = "grid points along an axis"
+
+    @property
+    def size(self):
+        return self._base.size + self.resolution**self.d
+
+    @property
+    def num_pilots(self):
+        return _PILOTS
+
+    @property
+    def num_sites(self):
+        return self._base.num_pilots + self.resolution**self.d
+
+    @property
+    def _base(self) -> Hermite:
+        """The polynomials that the grid corrects."""
+        return Hermite(self.d, max(_DEGREES))
+
+    def frame(self, states, good, scales):
+        inner = CovarianceFrame.of(states, good, scales)
+        z = inner.coordinates(states)
         least = jnp.min(jnp.where(good[:, None], z, jnp.inf), axis=0)
         most = jnp.max(jnp.where(good[:, None], z, -jnp.inf), axis=0)
-        # NaNs are left out.
-        few_paths = jnp.where(good[:, None], z, jnp.nan)[:num_for_quartiles]
+        # A few paths suffice for the quartiles. NaNs are left out.
+        few_paths = jnp.where(good[:, None], z, jnp.nan)[: self._base.num_pilots]
         probabilities = jnp.array([0.25, 0.5, 0.75])
         quartiles = jnp.nanquantile(few_paths, probabilities, axis=0)
         first_quartile, median, third_quartile = quartiles
@@ -96,80 +139,23 @@ class StretchedFrame(eqx.Module):
             edge=_compressed(_compressed(bend)),
         )
 
-    def coordinates(self, y: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
-        """The coordinates of states."""
-        scaled = self.factor * (self.inner.coordinates(y) - self.median)
-        return _compressed(_compressed(scaled)) / self.edge
-
-    def states(self, x: Float[Array, "*n d"]) -> Float[Array, "*n d"]:
-        """The states with these coordinates."""
-        unscaled = _expanded(_expanded(self.edge * x))
-        return self.inner.states(self.median + unscaled / self.factor)
-
-
-def _compressed(x: Array) -> Array:
-    """An odd function with slope 1 at zero, which grows like the square root. (It takes a
-    quarter of the time of a logarithm.)"""
-    return x / jnp.sqrt(jnp.sqrt(1 + x**2))
-
-
-def _expanded(x: Array) -> Array:
-    """The inverse of `_compressed`."""
-    return x * jnp.sqrt(x**2 / 2 + jnp.sqrt(1 + x**4 / 4))
-
-
-class Grid(AbstractBasis):
-    """A polynomial plus a correction on a grid, interpolated by polynomials of degree 5
-    through the 6 nearest points along each axis. The candidate is the number of points
-    along an axis. The correction falls to zero towards the edge of the grid; beyond it only
-    the polynomial remains, whose degree is the one that fits best near the edge."""
-
-    candidate_name: ClassVar[str] = "grid points along an axis"
-    d: int
-    candidates: tuple[int]
-
-    @property
-    def size(self):
-        return self._base.size + self.candidates[0] ** self.d
-
-    @property
-    def num_pilots(self):
-        return _PILOTS
-
-    @property
-    def num_sites(self):
-        return self._base.num_pilots + self.candidates[0] ** self.d
-
-    @property
-    def _base(self) -> Hermite:
-        """The polynomials that the grid corrects."""
-        return Hermite(self.d, _DEGREES)
-
-    def frame(self, states, good, scales):
-        inner = CovarianceFrame.of(states, good, scales)
-        return StretchedFrame.of(
-            inner, inner.coordinates(states), good, self._base.num_pilots
-        )
-
     def coefficients(self, target, frame, states, good, keys):
         base = self._base
         num_pilots = base.num_pilots
-        axes = [np.linspace(-1, 1, self.candidates[0])] * self.d
+        axes = [np.linspace(-1, 1, self.resolution)] * self.d
         # The coordinates of the grid points: (nodes, d).
         x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, self.d)
         nodes = frame.states(jnp.asarray(x, states.dtype))
         pilots = frame.inner.perturbed(states[:num_pilots])
         # All points are in one call, so that the target is compiled once.
         values = jax.vmap(target)(jnp.concatenate([pilots, nodes]))
-        # One copy of the values for each degree: (pilots, degrees, S, m).
-        values_at_pilots = jnp.repeat(values[:num_pilots], len(_DEGREES), axis=1)
         # (size of the base, degrees, S, m)
-        c = base.least_squares_fit(
-            values_at_pilots, frame.inner, pilots, good[:num_pilots]
+        c = base.least_squares_fits(
+            values[:num_pilots], frame.inner, pilots, good[:num_pilots], _DEGREES
         )
         polynomials = base.polynomials(frame.inner, nodes)
         # (nodes, degrees, S, m)
-        residual = values[num_pilots:] - tensordot(polynomials, c, 1)
+        residual = values[num_pilots:, None] - tensordot(polynomials, c, 1)
         # The target may overflow where it grows fast.
         residual = jnp.where(jnp.isfinite(residual), residual, 0)
         # The degree that leaves the least near the edge, for each time and component.
@@ -177,14 +163,14 @@ class Grid(AbstractBasis):
         is_near_edge = (distance > _START_NEAR_EDGE) & (distance < _START_OF_FALL)
         largest_residual = jnp.max(jnp.abs(residual[is_near_edge]), axis=0)
         best_degree = jnp.argmin(largest_residual, axis=0)[None, None]
-        c_of_best = jnp.take_along_axis(c, best_degree, 1)
-        residual_of_best = jnp.take_along_axis(residual, best_degree, 1)
+        c_of_best = jnp.take_along_axis(c, best_degree, 1)[:, 0]
+        residual_of_best = jnp.take_along_axis(residual, best_degree, 1)[:, 0]
         # The correction falls from the whole residual in the middle of the grid to zero at
         # its edge. Along each axis, the fall has two vanishing derivatives at both ends.
         fall = np.clip((np.abs(x) - _START_OF_FALL) / (1 - _START_OF_FALL), 0, 1)
         factors = np.prod(1 - fall**3 * (10 - 15 * fall + 6 * fall**2), axis=1)
         factors = jnp.asarray(factors, residual.dtype)
-        correction = residual_of_best * factors[:, None, None, None]
+        correction = residual_of_best * factors[:, None, None]
         return jnp.concatenate([c_of_best, correction])
 
     def value_at(self, frame, y, c):
@@ -197,7 +183,7 @@ class Grid(AbstractBasis):
     ) -> Float[Array, "..."]:
         """The values on the grid, interpolated at a point, and zero beyond the grid."""
         # The number of grid points along each axis.
-        n = self.candidates[0]
+        n = self.resolution
         value_shape = c.shape[1:]
         # The number of interpolation points on each side of the point.
         half = _STENCIL // 2

@@ -179,9 +179,9 @@ class Noise(eqx.Module):
             return jax.hessian(value_after)(zero)
 
         # One state after another, since a Hessian of many variables takes much memory.
-        # (C, S, m, n, n)
+        # (S, m, n, n)
         mean = jnp.mean(jax.lax.map(hessian, ys), axis=0)
-        # (n, n, C, S, m)
+        # (n, n, S, m)
         return jnp.moveaxis(mean, (-2, -1), (0, 1))
 
     def _value_after(

@@ -66,10 +66,10 @@ def _hermite_of_one_variable(
 
 
 def least_squares(
-    B: Float[Array, "n P"], values: Float[Array, "n C m"], sizes: Sequence[int]
-) -> Float[Array, "P C m"]:
-    """The coefficients of `C` fits, of which fit `k` uses the first `sizes[k]` polynomials
-    and has zeros for the others.
+    B: Float[Array, "n P"], values: Float[Array, "n m"], sizes: Sequence[int]
+) -> Float[Array, "P fits m"]:
+    """The coefficients of several fits to the values, of which fit `k` uses the first
+    `sizes[k]` polynomials and has zeros for the others.
 
     The normal equations are regularized, and the solution is refined. If the polynomials
     are linearly independent at the points, only rounding errors remain; if not, the
@@ -87,27 +87,25 @@ def least_squares(
     # A fit with fewer polynomials has a leading block of the normal equations, and its
     # Cholesky factor is the leading block of `L`. So one factorization serves all fits. The
     # rest of each factor is filled with the identity, so that all have the same shape.
-    # (C, P)
+    # (fits, P)
     is_used = np.arange(num_columns) < np.array(sizes)[:, None]
-    # (C, P, P)
+    # (fits, P, P)
     is_in_block = is_used[:, :, None] & is_used[:, None]
     factors = jnp.where(is_in_block, L, jnp.eye(num_columns, dtype=L.dtype))
 
-    def solution(
-        L: Float[Array, "P P"], rhs: Float[Array, "P m"]
-    ) -> Float[Array, "P m"]:
+    def solution(L, rhs):
         return jax.scipy.linalg.cho_solve((L, True), rhs)
 
-    def refine(_, c: Float[Array, "C P m"]) -> Float[Array, "C P m"]:
-        # (C, n, m)
-        residual = jnp.moveaxis(values, 1, 0) - dot(scaled_B, c)
+    def refine(_, c: Float[Array, "fits P m"]) -> Float[Array, "fits P m"]:
+        # (fits, n, m)
+        residual = values - dot(scaled_B, c)
         rhs = jnp.where(is_used[:, :, None], dot(scaled_B.T, residual), 0)
         return c + jax.vmap(solution)(factors, rhs)
 
-    no_fit = jnp.zeros((len(sizes), num_columns, values.shape[2]), values.dtype)
+    no_fit = jnp.zeros((len(sizes), num_columns, values.shape[1]), values.dtype)
     # The first refinement, which starts from zero, gives the solution itself.
     c = jax.lax.fori_loop(0, _REFINEMENTS, refine, no_fit)
-    # (P, C, m)
+    # (P, fits, m)
     c = jnp.moveaxis(c, 0, 1)
     # From the coefficients of the scaled polynomials to those of the caller's.
     return c / lengths[:, None, None]

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import jax.random as jr
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Int, PRNGKeyArray
+from jaxtyping import Bool, PRNGKeyArray
 
 from ..._arguments import check_memory, check_untraced, whole_number
 from ..._simulation import Combination, Problem
@@ -75,9 +75,9 @@ class ValueFunctions(AbstractSampling):
     **Arguments:**
 
     - `degree`: the total degree of the polynomials; degree 0 disables the control variate.
-        By default the best of the fits above is chosen for each component of $\phi$, or
-        none, by trials with fresh paths; polynomials have degree 8 at most and 130 terms at
-        most. Fits that would take long are made coarser.
+        By default the fit is as above, with polynomials of degree 8 at most and 130 terms
+        at most, and coarser where it would take long. For each component of $\phi$, a trial
+        with fresh paths decides whether the control variate is used.
     - `num_paths`: the number of paths to average; with `tol` an upper limit.
     - `batch_size`: the number of paths that each device solves at once.
 
@@ -112,10 +112,12 @@ class ValueFunctions(AbstractSampling):
         mixture = Mixture.of(problem)
 
         def plan_for(
-            choice: Int[np.ndarray, "S m"], mixture: Mixture, num_samples: int
+            is_used: Bool[np.ndarray, "S m"], mixture: Mixture, num_samples: int
         ) -> SamplingPlan:
             # A `Partial` is a PyTree: a program is compiled once for all arrays in it.
-            sampler = jtu.Partial(controlled_paths, problem, functions, choice, mixture)
+            sampler = jtu.Partial(
+                controlled_paths, problem, functions, is_used, mixture
+            )
             return SamplingPlan(
                 sampler,
                 outputs,
@@ -125,18 +127,14 @@ class ValueFunctions(AbstractSampling):
                 is_quick=True,
             )
 
-        # One trial for each candidate, on the same paths, which are not part of the
-        # estimate.
-        key_of_trials = jr.fold_in(key, _TRIAL_KEY)
-        trials = []
-        for number in range(1, len(basis.candidates) + 1):
-            same_for_all = np.full(problem.output_shape, number)
-            plan = plan_for(same_for_all, mixture, self.batch_size)
-            trials.append(run(plan, key_of_trials, devices))
-        choice, remainder = _comparison(trials, problem)
+        # A trial, whose paths are not part of the estimate.
+        always_used = np.ones(problem.output_shape, bool)
+        plan = plan_for(always_used, mixture, self.batch_size)
+        trial = run(plan, jr.fold_in(key, _TRIAL_KEY), devices)
+        is_used, remainder = _comparison(trial, problem)
         if self.degree == 0:
-            choice = np.zeros_like(choice)
-        if self.degree and not np.any(choice):
+            is_used = ~always_used
+        if self.degree and not np.any(is_used):
             warnings.warn(
                 f"`degree={self.degree}` is no better than no control variate, so none is "
                 "used. Pass another `degree`, or another `sampling`.",
@@ -144,26 +142,22 @@ class ValueFunctions(AbstractSampling):
             )
         # If paths fail, those of the other laws, which go further out, fail far more often,
         # and show nothing of the rare paths for which they are there.
-        if any(trial.num_failed > 0 for trial in trials) or not np.any(choice):
+        if trial.num_failed > 0 or not np.any(is_used):
             mixture = mixture.own_law_alone()
-        plan = plan_for(choice, mixture, self.num_paths)
-        # Without a control variate, the candidate is zero.
-        options = np.array([0, *basis.candidates])
+        plan = plan_for(is_used, mixture, self.num_paths)
+        # Zero stands for no control variate.
+        used = np.unique(np.where(is_used, basis.resolution, 0))
+        options = np.unique([0, basis.resolution])
         return plan._replace(
             reason=(
-                f"{basis.candidate_name}: {_listed(options[choice])}, chosen among "
-                f"{_listed(options)}"
+                f"{basis.resolution_name}: {', '.join(map(str, used))}, chosen among "
+                f"{', '.join(map(str, options))}"
             ),
             remainder=remainder,
             with_halved_steps=(
                 ft.partial(_with_halved_steps, plan, key) if chosen.is_quick else None
             ),
         )
-
-
-def _listed(options: np.ndarray) -> str:
-    """The options, each of them once, such as `0, 2, 4`."""
-    return ", ".join(map(str, np.unique(options)))
 
 
 def _with_halved_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
@@ -182,25 +176,21 @@ def _with_halved_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
 
 
 def _comparison(
-    trials: list[Expectation], problem: Problem
-) -> tuple[Int[np.ndarray, "S m"], float]:
-    """Compares the candidates, by a trial of each. The number of the best candidate for
-    each time and component, counted from 1, or 0 where none is better than none; and the
-    largest fraction of a standard error that remains with them."""
-    results = [combined_results(trial, Combination.BEST) for trial in trials]
-    # (C, S * m). A candidate whose error is NaN has failed.
-    errors = np.nan_to_num([result.std_error for result in results], nan=np.inf)
-    least_errors = np.min(errors, axis=0)
-    # The trials have the same paths, so without control their results are the same.
-    plain_errors = results[0].plain_std_error
-    is_no_better = least_errors >= plain_errors
-    choice = np.where(is_no_better, 0, 1 + np.argmin(errors, axis=0))
+    trial: Expectation, problem: Problem
+) -> tuple[Bool[np.ndarray, "S m"], float]:
+    """For which times and components the control variate of a trial is better than none;
+    and the largest fraction of a standard error that remains with it."""
+    result = combined_results(trial, Combination.BEST)
+    # A fit whose error is NaN has failed.
+    errors = np.nan_to_num(result.std_error, nan=np.inf)
+    plain_errors = result.plain_std_error
+    # Written as a negation, so that a fit is used if the error without it is NaN.
+    is_used = ~(errors >= plain_errors)
     # Where nothing is random, as for a constant `phi`, both errors are rounding errors.
-    rounding = ROUNDING * np.finfo(problem.dtype).eps * np.abs(results[0].mean)
+    rounding = ROUNDING * np.finfo(problem.dtype).eps * np.abs(result.mean)
     is_random = plain_errors > rounding
-    fractions = np.minimum(least_errors, plain_errors)[is_random]
-    fractions = fractions / plain_errors[is_random]
-    return choice.reshape(problem.output_shape), float(np.max(fractions, initial=0.0))
+    fractions = np.minimum(errors, plain_errors)[is_random] / plain_errors[is_random]
+    return is_used.reshape(problem.output_shape), float(np.max(fractions, initial=0.0))
 
 
 def _fits(

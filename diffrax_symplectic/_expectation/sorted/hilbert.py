@@ -16,10 +16,6 @@ _COORDINATE_BITS = 16
 # left out at either end. It need not be accurate, since the grid is three times as wide.
 _SAMPLE_SIZE = 256
 _SHARE_OF_OUTLIERS = 1 / 50
-# The bits of an unsigned integer of 64 or 32 bits, less the highest, which marks the rows
-# at the end.
-_BITS_OF_UINT64 = 63
-_BITS_OF_UINT32 = 31
 
 
 def hilbert_order(
@@ -27,44 +23,37 @@ def hilbert_order(
 ) -> Int32[Array, " n"]:
     """The indices of the rows of `z`, the coordinates of states, in order along Hilbert's
     curve, with the rows marked `is_last` at the end."""
-    n, _ = z.shape
+    n, num_coordinates = z.shape
     rows = jnp.arange(n, dtype=jnp.int32)
-    if jnp.result_type(float) == np.float32:
-        bits = _BITS_OF_UINT32
-        places = _places_on_curve(_cells(z, bits), bits, jnp.uint32)
-        # Beyond all places on the curve.
-        places = jnp.where(is_last, np.uint32(2**bits), places)
+    has_64_bits = jnp.result_type(float) == np.float64
+    dtype = np.uint64 if has_64_bits else np.uint32
+    row_bits = (n - 1).bit_length() if has_64_bits else 0
+    # The highest bit marks the rows at the end.
+    total_bits = np.iinfo(dtype).bits - 1 - row_bits
+    # Coordinates for which no bit is left are dropped.
+    d = min(num_coordinates, total_bits)
+    bits = min(_COORDINATE_BITS, total_bits // d)
+    places = _places_on_curve(_cells(z[:, :d], bits), bits, dtype)
+    # Beyond all places on the curve.
+    places = jnp.where(is_last, dtype(2**total_bits), places)
+    if not has_64_bits:
         _, order = lax.sort((places, rows), num_keys=1)
         return order
-
     # On CPUs XLA sorts a single array of unsigned integers ten times as fast as anything
     # else, so the row's number is packed into the bits below its place on the curve.
-    row_bits = (n - 1).bit_length()
-    bits = _BITS_OF_UINT64 - row_bits
-    places = _places_on_curve(_cells(z, bits), bits, jnp.uint64)
-    places = jnp.where(is_last, np.uint64(2**bits), places)
-    packed = jnp.sort((places << np.uint64(row_bits)) | rows.astype(jnp.uint64))
-    return (packed & np.uint64(2**row_bits - 1)).astype(jnp.int32)
+    packed = jnp.sort((places << dtype(row_bits)) | rows.astype(dtype))
+    return (packed & dtype(2**row_bits - 1)).astype(jnp.int32)
 
 
-def _bits_of_coordinate(d: int, total_bits: int) -> int:
-    """The bits of each of `d` coordinates that share `total_bits`."""
-    return max(1, min(_COORDINATE_BITS, total_bits // d))
-
-
-def _cells(z: Float[Array, "n d"], total_bits: int) -> list[UInt32[Array, " n"]]:
-    """The coordinates of points as integers, the cells of a grid, which share `total_bits`.
-    Coordinates for which no bit is left are dropped.
+def _cells(z: Float[Array, "n d"], bits: int) -> list[UInt32[Array, " n"]]:
+    """The coordinates of points as integers of so many bits, the cells of a grid.
 
     The grid is three times as wide as the range of nearly all states, and outliers are
     clipped to its edges, so that they do not coarsen it.
     """
-    n, num_coordinates = z.shape
-    d = min(num_coordinates, total_bits)
-    bits = _bits_of_coordinate(d, total_bits)
-    z = jnp.nan_to_num(z[:, :d])
+    z = jnp.nan_to_num(z)
     # Some states at equal distances in `z`, of which each coordinate is sorted by itself.
-    stride = max(1, n // _SAMPLE_SIZE)
+    stride = max(1, len(z) // _SAMPLE_SIZE)
     sample = jnp.sort(z[::stride], axis=0)
     num_outliers = int(len(sample) * _SHARE_OF_OUTLIERS)
     low = sample[num_outliers]
@@ -76,15 +65,15 @@ def _cells(z: Float[Array, "n d"], total_bits: int) -> list[UInt32[Array, " n"]]
     positions = thirds * np.asarray(2.0**bits / 3, z.dtype)
     # Integers of at most 16 bits are exact in single precision.
     cells = jnp.clip(positions, 0, 2.0**bits - 1).astype(jnp.uint32)
-    return [cells[:, i] for i in range(d)]
+    return [cells[:, i] for i in range(z.shape[1])]
 
 
 def _places_on_curve(
-    cells: list[UInt32[Array, " n"]], total_bits: int, dtype: Any
+    cells: list[UInt32[Array, " n"]], bits: int, dtype: Any
 ) -> UInt[Array, " n"]:
-    """The place of each cell along Hilbert's curve, an integer of this dtype, by the
-    algorithm of [Skilling (2004)](https://doi.org/10.1063/1.1751381)."""
-    bits = _bits_of_coordinate(len(cells), total_bits)
+    """The place along Hilbert's curve of each cell, whose coordinates have so many bits, as
+    an integer of this dtype, by the algorithm of [Skilling
+    (2004)](https://doi.org/10.1063/1.1751381)."""
     # In one dimension the curve is the line itself.
     transposed = cells if len(cells) == 1 else _transposed_place(cells, bits)
     # The bits of the place are dealt out in turn to the numbers in `transposed`, the
