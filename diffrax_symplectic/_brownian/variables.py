@@ -34,17 +34,6 @@ def _path_with_plateaus(shape: Any, key: PRNGKeyArray) -> PlateauBrownianPath:
     return PlateauBrownianPath(_path_with_space_time_area(shape, key), key)
 
 
-class SourceAttributes(NamedTuple):
-    """The attributes of an increment from which a random variable is computed.
-
-    - `required`: those that it cannot do without.
-    - `optional`: those that are used if the increment has them.
-    """
-
-    required: tuple[str, ...]
-    optional: tuple[str, ...]
-
-
 class RandomVariable(NamedTuple):
     """One random variable of a step for each noise (or for each pair of noises).
 
@@ -59,8 +48,6 @@ class RandomVariable(NamedTuple):
         random variables.
     - `drives`: the vector fields that it multiplies: the noise, the brackets between
         noises, or their brackets with the drift.
-    - `held`: if it is not an attribute of the increment itself, the attributes in which
-        the increment holds it.
     """
 
     increment: type[diffrax.AbstractBrownianIncrement]
@@ -70,7 +57,6 @@ class RandomVariable(NamedTuple):
     variance: float | None = 1.0
     even: bool = False
     drives: Literal["noise", "noise brackets", "drift brackets"] = "noise"
-    held: SourceAttributes | None = None
 
     @property
     def advice(self) -> str:
@@ -110,11 +96,10 @@ VARIABLES = {
     # The sign of `C`. Only the sign is drawn: the size is a function of `W` and `H`.
     "sign": _plateau(variance=1.0),
     "L": _area(
-        # A quadratic form in other variables.
+        # A quadratic form in `W`, `H` and, if the increment has it, `K`.
         variance=None,
         even=True,
         drives="drift brackets",
-        held=SourceAttributes(required=("W", "H"), optional=("K",)),
     ),
     # The time-reversed bridge has the same integral.
     "H": _area(variance=1 / 12, even=True),

@@ -16,7 +16,7 @@ from .._simulation import (
     Problem,
     with_next_level,
 )
-from .._solver import path_of_array_cell
+from .._solver import common_path
 from .._terms import (
     brownian_paths,
     has_unknown_law,
@@ -244,7 +244,7 @@ def _with_finer_level(problem: Problem, key: PRNGKeyArray) -> Problem:
     begins_at_cell = is_multiple(float(problem.t0), float(finest))
     if begins_at_cell and not has_discrete_increments(problem.solver):
         # An array, so that another cell compiles nothing anew.
-        path = ft.partial(path_of_array_cell, problem.solver, np.asarray(finest))
+        path = ft.partial(common_path, problem.solver, np.asarray(finest))
         numbers = motion_numbers(random_paths(terms))
         terms = with_paths(path, numbers, terms, key)
     weights = finer_change_weights(problem.order, len(problem.levels.h))

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
 
-import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
@@ -13,7 +12,7 @@ from jaxtyping import Array, Bool, Float, PyTree, Scalar
 
 from .._batch import batched_like
 from .._custom_types import IntScalarLike
-from .linear import correction, NewtonCorrection
+from .linear import correction
 from .tolerance import all_finite, converged, largest, log2, max_norm, ratio, Tolerance
 
 
@@ -66,70 +65,40 @@ class Progress(NamedTuple):
     has_turned_back: Bool[Array, ""]
 
 
-class Newton(eqx.Module):
+def solve_by_newton(
+    residual: Callable[[_Vector], _Vector],
+    guess: _Vector,
+    start: _Vector,
+    restore: Callable[[_Vector], PyTree[Array]],
+    scale: Callable[[PyTree[Array]], PyTree[Array]],
+    tolerance: Tolerance,
+    linear_solver: lx.AbstractLinearSolver | None,
+    max_iterations: int,
+) -> tuple[_Vector, optx.RESULTS]:
     """Newton's method with continuation, for `residual(k) = 0` with a vector `k`: first for
-    the full equations, and if that fails, part by part from `start`. `restore` maps the
-    vector to a PyTree, for which `scale` and `tolerance` are meant."""
+    the full equations from a `guess`, and if that fails, part by part from `start`. Returns
+    the last iterate, after at most so many iterations, and whether it is a solution.
+    `restore` maps the vector to a PyTree, for which `scale` and `tolerance` are meant."""
 
-    residual: Callable[[_Vector], _Vector]
-    start: _Vector
-    restore: Callable[[_Vector], PyTree[Array]]
-    scale: Callable[[PyTree[Array]], PyTree[Array]]
-    tolerance: Tolerance
-    linear_solver: lx.AbstractLinearSolver | None
+    def is_going(carry: tuple) -> Bool[Array, ""]:
+        count, _, progress = carry
+        in_time = count < max_iterations
+        return in_time & ~progress.is_solved & ~progress.has_turned_back
 
-    def solve(
-        self, guess: _Vector, max_iterations: int
-    ) -> tuple[_Vector, optx.RESULTS]:
-        """The last iterate from a `guess`, after at most so many iterations, and whether it
-        is a solution."""
-        # With `optx.root_find` a step would take a seventh longer to trace.
-        zero = jnp.zeros((), self.start.dtype)
-        false = jnp.array(False)
-        start = Progress(
-            anchor=self.start,
-            reached=zero,
-            target=zero + 1,
-            tries=jnp.array(0),
-            size=zero,
-            is_solved=false,
-            has_turned_back=false,
-        )
-        start, count = batched_like((start, jnp.array(0)), guess)
-
-        def is_going(carry):
-            count, _, progress = carry
-            in_time = count < max_iterations
-            return in_time & ~progress.is_solved & ~progress.has_turned_back
-
-        def body(carry):
-            count, k, progress = carry
-            return count + 1, *self.step(k, progress)
-
-        _, k, progress = lax.while_loop(is_going, body, (count, guess, start))
-        R: Any = optx.RESULTS
-        # Where steps leave the domain of the equations, the last correction is not finite.
-        no_solution = R.where(
-            jnp.isfinite(progress.size), R.nonlinear_divergence, R.nonfinite
-        )
-        failure = R.where(
-            progress.has_turned_back, no_solution, R.nonlinear_max_steps_reached
-        )
-        return k, R.where(progress.is_solved, R.successful, failure)
-
-    def step(self, k: _Vector, progress: Progress) -> tuple[_Vector, Progress]:
-        """One iteration from the iterate `k` for the current target: the corrected iterate,
-        or the guess for the next target."""
+    def iterate(carry: tuple) -> tuple:
+        """One iteration for the current target: the corrected iterate, or the guess for the
+        next target."""
+        count, k, progress = carry
         s = progress.target
         is_whole_step = progress.target == 1
 
         def equations(k: _Vector) -> _Vector:
-            return (1 - s) * (k - self.start) + s * self.residual(k)
+            return (1 - s) * (k - start) + s * residual(k)
 
-        newton = correction(equations, k, self.linear_solver)
+        newton = correction(equations, k, linear_solver)
         next_k = k - newton.change
-        scale = self.scale(self.restore(next_k))
-        correction_size = self.tolerance.measure(self.restore(newton.change), scale)
+        scale_of_next = scale(restore(next_k))
+        correction_size = tolerance.measure(restore(newton.change), scale_of_next)
         size = correction_size.size
         # The first correction has none to be compared with.
         shrinkage = jnp.where(progress.tries > 0, ratio(size, progress.size), 1)
@@ -139,8 +108,14 @@ class Newton(eqx.Module):
             correction_size.is_rounding,
             has_stalled=shrinkage >= _SHRINKAGE_AT_ROUNDING,
         )
+        # Far from any solution, rounding errors of a large Jacobian can hide the unknowns
+        # with small coefficients. Corrections are then small, but not the residual, which
+        # for a solution is no larger than the state.
         size_of_iterate = max_norm(k)
-        is_correct = self._is_correct(newton, next_k, scale, size_of_iterate)
+        size_of_scale = largest([max_norm(x) for x in jtu.tree_leaves(scale_of_next)])
+        allowed_residual = jnp.maximum(size_of_scale, size_of_iterate)
+        residual_fits = max_norm(newton.residual) <= allowed_residual + tolerance.atol
+        is_correct = newton.found & residual_fits & all_finite(next_k)
         is_solved = has_converged & is_whole_step & is_correct
         is_near = max_norm(newton.change) < _TOLERANCE_OF_PART * size_of_iterate
         part_is_solved = is_near & ~is_whole_step
@@ -149,25 +124,33 @@ class Newton(eqx.Module):
         )
         cannot_go_on = _cannot_go_on(next_progress, shrinkage, is_whole_step)
         has_failed = cannot_go_on & ~part_is_solved & ~is_solved
-        return _next_target(next_progress, next_k, part_is_solved, has_failed)
+        return count + 1, *_next_target(
+            next_progress, next_k, part_is_solved, has_failed
+        )
 
-    def _is_correct(
-        self,
-        newton: NewtonCorrection,
-        next_k: _Vector,
-        scale: PyTree[Array],
-        size_of_iterate: Scalar,
-    ) -> Bool[Array, ""]:
-        """Whether a small correction is that of a solution: whether its linear system was
-        solved, and the residual is no larger than the state.
-
-        Far from any solution, rounding errors of a large Jacobian can hide the unknowns
-        with small coefficients. Corrections are then small, but not the residual."""
-        size_of_scale = largest([max_norm(x) for x in jtu.tree_leaves(scale)])
-        allowed_residual = jnp.maximum(size_of_scale, size_of_iterate)
-        allowed_residual = allowed_residual + self.tolerance.atol
-        residual_fits = max_norm(newton.residual) <= allowed_residual
-        return newton.found & residual_fits & all_finite(next_k)
+    # With `optx.root_find` a step would take a seventh longer to trace.
+    zero = jnp.zeros((), start.dtype)
+    false = jnp.array(False)
+    first = Progress(
+        anchor=start,
+        reached=zero,
+        target=zero + 1,
+        tries=jnp.array(0),
+        size=zero,
+        is_solved=false,
+        has_turned_back=false,
+    )
+    first, count = batched_like((first, jnp.array(0)), guess)
+    _, k, progress = lax.while_loop(is_going, iterate, (count, guess, first))
+    R: Any = optx.RESULTS
+    # Where steps leave the domain of the equations, the last correction is not finite.
+    no_solution = R.where(
+        jnp.isfinite(progress.size), R.nonlinear_divergence, R.nonfinite
+    )
+    failure = R.where(
+        progress.has_turned_back, no_solution, R.nonlinear_max_steps_reached
+    )
+    return k, R.where(progress.is_solved, R.successful, failure)
 
 
 def _cannot_go_on(

@@ -13,7 +13,7 @@ from jaxtyping import Array, Bool, PyTree, Scalar
 from .._arguments import whole_number
 from .._batch import batched_like, where_pending
 from .._compat import ω
-from .newton import Newton
+from .newton import solve_by_newton
 from .sweeps import solve_by_sweeps
 from .tolerance import all_finite, Tolerance
 
@@ -107,10 +107,6 @@ class PicardNewton(
                     f"`{name}` of `PicardNewton` must be >= 0; got {number}."
                 )
 
-    @property
-    def _tolerance(self) -> Tolerance:
-        return Tolerance(self.rtol, self.atol, self.norm)
-
     def init(self, fn, y, args, options, f_struct, aux_struct, tags) -> _FinderState:
         del fn, args, options, f_struct, tags
         is_solved, result = batched_like((jnp.array(False), _SUCCESSFUL), y)
@@ -123,13 +119,19 @@ class PicardNewton(
         # so that the others of its batch need not wait for it, and counts as solved: the
         # path stays not finite, which its caller sees.
         can_solve = all_finite(y)
-        solve = ft.partial(solve_by_sweeps, self._tolerance, self.picard_steps)
+        tolerance = Tolerance(self.rtol, self.atol, self.norm)
+        sweep = ft.partial(solve_by_sweeps, tolerance, self.picard_steps)
         if "solve_blocks" in options:
             solve_blocks = options["solve_blocks"]
-            by_sweeps, solved_by_sweeps = solve_blocks(args, solve, y, can_solve)
+            by_sweeps, solved_by_sweeps = solve_blocks(args, sweep, y, can_solve)
         else:
-            image = _image(fn, args)
-            by_sweeps, solved_by_sweeps = solve(image, scale, y, can_solve)
+
+            def image(k: PyTree[Array]) -> PyTree[Array]:
+                # The equations are given as k - Phi(k) = 0.
+                residual, _ = fn(k, args)
+                return (k**ω - residual**ω).ω
+
+            by_sweeps, solved_by_sweeps = sweep(image, scale, y, can_solve)
         # Newton's method is for the paths that sweeps did not solve.
         pending = can_solve & ~solved_by_sweeps
         if self.newton_steps == 0:
@@ -137,50 +139,33 @@ class PicardNewton(
             y_new = by_sweeps
             result = optx.RESULTS.where(pending, _UNSOLVED, _SUCCESSFUL)
         else:
-            y_new, result = self._by_newton(fn, scale, args, y, by_sweeps, pending)
+            # The unknowns are one vector: a loop needs separate kernels to select, gather
+            # and scatter each array of its state.
+            k, restore = jfu.ravel_pytree(by_sweeps)
+            # Continuation starts from the guess of the step, not where the sweeps ended.
+            start, _ = jfu.ravel_pytree(y)
+
+            solver = self.linear_solver
+            max_steps = self.newton_steps
+
+            def residual(k: Array) -> Array:
+                value, _ = fn(restore(k), args)
+                return jfu.ravel_pytree(value)[0]
+
+            def solve(value: tuple[Array, optx.RESULTS]) -> tuple[Array, optx.RESULTS]:
+                k, _ = value
+                return solve_by_newton(
+                    residual, k, start, restore, scale, tolerance, solver, max_steps
+                )
+
+            k, result = where_pending(solve, pending, (k, _SUCCESSFUL))
+            y_new = restore(k)
         is_solved = result == _SUCCESSFUL
         aux = state.aux
         # The equations are evaluated once more only if there is auxiliary output.
         if jtu.tree_leaves(state.aux):
             _, aux = fn(y_new, args)
         return y_new, _FinderState(is_solved, result, state.aux), aux
-
-    def _by_newton(
-        self,
-        fn: Callable,
-        scale: Callable,
-        args: Any,
-        guess: PyTree[Array],
-        by_sweeps: PyTree[Array],
-        pending: Bool[Array, ""],
-    ) -> tuple[PyTree[Array], optx.RESULTS]:
-        """The solution by Newton's method for the `pending` paths, which sweeps did not
-        solve, and the solution `by_sweeps` for all others; and the results."""
-        # The unknowns are one vector: a loop needs separate kernels to select, gather and
-        # scatter each array of its state.
-        k, restore = jfu.ravel_pytree(by_sweeps)
-
-        def residual(k: Array) -> Array:
-            value, _ = fn(restore(k), args)
-            return jfu.ravel_pytree(value)[0]
-
-        # Continuation starts from the guess of the step, not from where the sweeps ended.
-        start, _ = jfu.ravel_pytree(guess)
-        newton = Newton(
-            residual=residual,
-            start=start,
-            restore=restore,
-            scale=scale,
-            tolerance=self._tolerance,
-            linear_solver=self.linear_solver,
-        )
-
-        def solve(value: tuple[Array, optx.RESULTS]) -> tuple[Array, optx.RESULTS]:
-            k, _ = value
-            return newton.solve(k, self.newton_steps)
-
-        k, result = where_pending(solve, pending, (k, _SUCCESSFUL))
-        return restore(k), result
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
@@ -193,13 +178,3 @@ class PicardNewton(
 
 def _unknowns_themselves(k: PyTree[Array]) -> PyTree[Array]:
     return k
-
-
-def _image(fn: Callable, args: Any) -> Callable[[PyTree[Array]], PyTree[Array]]:
-    r"""The map $\Phi$ of equations that are given as $k - \Phi(k) = 0$."""
-
-    def image(k: PyTree[Array]) -> PyTree[Array]:
-        residual, _ = fn(k, args)
-        return (k**ω - residual**ω).ω
-
-    return image

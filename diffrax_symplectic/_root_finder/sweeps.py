@@ -75,28 +75,6 @@ class _SweepState(NamedTuple):
     num_ahead: IntScalarLike
 
 
-class _AfterSweeps(NamedTuple):
-    """The result of the sweeps between two checks.
-
-    - `correction`: the last correction.
-    - `y`: the iterate.
-    """
-
-    correction: PyTree[Array]
-    y: Halves
-
-
-class _Decision(NamedTuple):
-    """The decision at a convergence check.
-
-    - `state`: the next state, except for the iterate.
-    - `goes_back`: whether to go back to the guess.
-    """
-
-    state: _SweepState
-    goes_back: Bool[Array, ""]
-
-
 def solve_by_sweeps(
     tolerance: Tolerance,
     max_sweeps: int,
@@ -125,7 +103,13 @@ def solve_by_sweeps(
     in_halves = isinstance(guess, Halves)
     start = guess if in_halves else Halves(guess, guess)
     dtype = jnp.result_type(*jtu.tree_leaves(guess))
-    first_sweeps = _sweeps_before_first_check(dtype, in_halves)
+    in_single = jnp.finfo(dtype).bits < 64
+    if in_halves:
+        first_sweeps = _FIRST_IN_SINGLE if in_single else _FIRST_IN_DOUBLE
+    else:
+        first_sweeps = (
+            _FIRST_DOUBLED_IN_SINGLE if in_single else _FIRST_DOUBLED_IN_DOUBLE
+        )
 
     # The halves of a doubled system agree in the end.
     def value_of(y: PyTree[Array]) -> PyTree[Array]:
@@ -173,16 +157,11 @@ def solve_by_sweeps(
     return value_of(state.y), state.is_solved
 
 
-def _sweeps_before_first_check(dtype, in_halves: bool) -> int:
-    """The number of sweeps before the first convergence check, for unknowns of this dtype,
-    in halves or as a doubled system."""
-    if jnp.finfo(dtype).bits < 64:
-        return _FIRST_IN_SINGLE if in_halves else _FIRST_DOUBLED_IN_SINGLE
-    return _FIRST_IN_DOUBLE if in_halves else _FIRST_DOUBLED_IN_DOUBLE
-
-
-def _sweep_until_check(image: Map, state: _SweepState, in_halves: bool) -> _AfterSweeps:
-    """The iterate after all sweeps until the next check, and the last correction."""
+def _sweep_until_check(
+    image: Map, state: _SweepState, in_halves: bool
+) -> tuple[PyTree[Array], Halves]:
+    """The last correction of all sweeps until the next check, and the iterate after
+    them."""
 
     # Each half is taken from an evaluation of its own. XLA drops what an evaluation
     # computes for the other half.
@@ -207,12 +186,12 @@ def _sweep_until_check(image: Map, state: _SweepState, in_halves: bool) -> _Afte
         y = lax.fori_loop(0, state.num_ahead, sweep, state.y)
         # The halves may converge to different solutions of y = \Phi(\Phi(y)), which do not
         # solve y = \Phi(y). Only their difference shows that: it serves as the correction.
-        return _AfterSweeps((y.q**ω - y.p**ω).ω, y)
+        return (y.q**ω - y.p**ω).ω, y
     # A loop that also carried the previous iterate would copy it in each sweep: steps of 64
     # pairs took 1.1 to 1.4 times as long, although the program was a tenth shorter.
     before_last = lax.fori_loop(0, state.num_ahead - 1, sweep, state.y)
     y = sweep(None, before_last)
-    return _AfterSweeps((y**ω - before_last**ω).ω, y)
+    return (y**ω - before_last**ω).ω, y
 
 
 def _decide(
@@ -222,11 +201,11 @@ def _decide(
     size: CorrectionSize,
     first_sweeps: int,
     max_sweeps: int,
-) -> _Decision:
-    """What to do next, after a correction of this `size`, whose base-2 logarithm is
-    `log2_size`. The correction at the last check had the logarithm `last_log2_size`.
-    `first_sweeps` is the number of sweeps before the first check, and `max_sweeps` the most
-    in all."""
+) -> tuple[_SweepState, Bool[Array, ""]]:
+    """The next state, except for the iterate, and whether to go back to the guess, after a
+    correction of this `size`, whose base-2 logarithm is `log2_size`. The correction at the
+    last check had the logarithm `last_log2_size`. `first_sweeps` is the number of sweeps
+    before the first check, and `max_sweeps` the most in all."""
     # The rate is the factor by which a correction shrinks in one sweep. In logarithms it is
     # a difference per sweep, and the number of further sweeps is a quotient.
     log2_rate = (log2_size - last_log2_size) / state.num_ahead
@@ -266,7 +245,7 @@ def _decide(
         # The path of the batch that needs the most sweeps decides for all.
         num_ahead=jnp.minimum(largest_in_batch(num_ahead), _MOST_BETWEEN_CHECKS),
     )
-    return _Decision(next_state, goes_back=~(keeps_iterate | has_converged))
+    return next_state, ~(keeps_iterate | has_converged)
 
 
 def best_relaxation(rate: Scalar) -> Scalar:

@@ -18,7 +18,8 @@ What they are made of:
 """
 
 from .base import AbstractImplicitStages, AbstractSymplecticRungeKutta
-from .base import AbstractSymplecticSolver
+from .base import AbstractSymplecticSolver, has_newton, IMPLICIT_ARGUMENTS
+from .base import with_changed_stages, without_newton
 from .record import Record, Want
 from .general import ImplicitMidpoint, SRKs1, SRKw1, SRKw2
 from .bath import after_friction
@@ -26,13 +27,12 @@ from .beyond import StrangGauss, NinomiyaVictoir, PlateauGauss, LevyAreaMidpoint
 from .separable import SRKs2, SRKs3, SRKw3, SRKw4, StormerVerlet, PlateauVerlet
 from .additive import SRKs4, SRKw5, AdditiveGauss
 from .langevin import BAOAB, LangevinMiddle
-from .splitting import AbstractLangevinSplitting, kicks_and_rest, Splitting
-from .pieces import AbstractPiece, Bath, Flight, Flow, Kick
+from .splitting import AbstractLangevinSplitting, Splitting
+from .pieces import AbstractPiece, Bath, Flight, Flow, Kick, kicks_and_rest
 from .fast_flow import LinearFlow
 from .flow import is_solver
 from .linear_flow import linear_flow
-from .paths import common_path, own_path, path_of_array_cell
-from .root_finders import has_newton, with_changed_stages, without_newton
+from .paths import common_path, own_path
 from .times import check_resolution
 
 
@@ -58,3 +58,6 @@ SOLVERS: tuple[type[AbstractSymplecticSolver], ...] = (
     SRKw5,
     AdditiveGauss,
 )
+for _kind in SOLVERS:
+    if issubclass(_kind, AbstractImplicitStages):
+        _kind.__init__.__doc__ = IMPLICIT_ARGUMENTS

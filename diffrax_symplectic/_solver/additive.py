@@ -9,7 +9,6 @@ from .._tableau import AdditiveTableau
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
-    documented,
     free_parameter,
     real_number,
 )
@@ -37,7 +36,6 @@ def _checked_sign(value: Any) -> int:
     return int(value)
 
 
-@documented
 class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic methods SRKs4 of Wang, Hong and Xu, of strong order 3/2 for any
     number of noises that do not depend on the state.
@@ -108,7 +106,6 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         )
 
 
-@documented
 class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic method SRKw5 of Wang, Hong and Xu, of weak order 2 for any number of
     noises that depend neither on the state nor on time.
@@ -148,7 +145,6 @@ class SRKw5(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 _ETA = np.sqrt(1 / 6)
 
 
-@documented
 class AdditiveGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""A symplectic method of weak order 3 for any number of noises that depend neither on
     the state nor on time: the Gauss method of two stages, with three random variables for

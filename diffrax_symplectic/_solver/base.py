@@ -5,17 +5,12 @@ import dataclasses
 import functools as ft
 import math
 from collections.abc import Callable
-from typing import (
-    Any,
-    cast,
-    ClassVar,
-    TYPE_CHECKING,
-    TypeVar,
-)
+from typing import Any, cast, ClassVar, TYPE_CHECKING
 
 import diffrax
 import equinox as eqx
 import jax
+import jax.tree_util as jtu
 import optimistix as optx
 from jaxtyping import ArrayLike, PRNGKeyArray, PyTree
 
@@ -30,7 +25,6 @@ from .._tableau import (
     FlatTableau,
     is_own_inverse,
     make_plan,
-    Stage,
     Structure,
 )
 from .._terms import check_structure, number_of_noises, split_terms
@@ -111,15 +105,13 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
         # Solvers of the user's own need no record.
         if self.record is None:
             return None
-        order_if_commuting = self.record.order(want, commute=True)
-        order_if_not = self.record.order(want, commute=False)
         # The terms are looked at only if it matters: for most solvers they may be `None`.
-        if order_if_commuting == order_if_not:
-            return order_if_commuting
         # One noise commutes with itself, and without noise there is nothing to commute.
         # Whether several commute depends on values, which are not known here, so the lower
         # order is returned.
-        return order_if_commuting if number_of_noises(terms) <= 1 else order_if_not
+        is_one_order = not isinstance(getattr(self.record, want), tuple)
+        commute = is_one_order or number_of_noises(terms) <= 1
+        return self.record.order(want, commute)
 
     def path(
         self,
@@ -175,9 +167,9 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
             if field.repr and not is_default:
                 # `tree_pformat` would ignore the `__repr__` of a module, such as this one.
                 is_module = isinstance(value, eqx.Module)
-                text = repr(value)
-                if not is_module:
-                    text = eqx.tree_pformat(value, width=1_000)
+                text = (
+                    repr(value) if is_module else eqx.tree_pformat(value, width=1_000)
+                )
                 arguments.append(f"{field.name}={text}")
         return f"{type(self).__name__}({', '.join(arguments)})"
 
@@ -260,18 +252,11 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         begin, end, y0, solver_state = batched_like(inputs, (inputs, terms, args))
         h = end - begin
         by_drift = drift_change(drift, begin, end, args)
-        by_noise = noise_changes(
-            by_drift,
-            h,
-            noise,
-            _variables(plan.tableau),
-            # The path gets the unbatched times: if these are the same for all paths of a
-            # batch, so is the place of the step in the path.
-            t0,
-            t1,
-            args,
-            type(self).__name__,
-        )
+        # The path gets the unbatched times: if these are the same for all paths of a batch,
+        # so is the place of the step in the path.
+        names = _variables(plan.tableau)
+        solver_name = type(self).__name__
+        by_noise = noise_changes(by_drift, h, noise, names, t0, t1, args, solver_name)
         changes = {"h": by_drift, **by_noise} if drift else by_noise
         y1, outcome = take_step(plan, Step(begin, h, changes), y0, self, solver_state)
         result = result_with_times_checked(terms, t0, t1, result_of(outcome, y1))
@@ -291,14 +276,11 @@ def _without_idle_stages(
     driven = tableau.take(driven_stages)
     if len(drift) > 0:
         return driven
-    stages = tuple(_without_drift_brackets(stage) for stage in driven.stages)
-    return dataclasses.replace(driven, stages=stages)
-
-
-def _without_drift_brackets(stage: Stage) -> Stage:
-    """The stage without the channels that drive brackets of drift and noise."""
-    channels = [name for name in stage.channels if drives(name) != "drift brackets"]
-    return stage._replace(channels=tuple(channels))
+    stages = []
+    for stage in driven.stages:
+        channels = [x for x in stage.channels if drives(x) != "drift brackets"]
+        stages.append(stage._replace(channels=tuple(channels)))
+    return dataclasses.replace(driven, stages=tuple(stages))
 
 
 def _variables(tableau: FlatTableau) -> list[str]:
@@ -330,7 +312,7 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
     root_finder: optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver = eqx.field(
         default=PicardNewton(), kw_only=True, converter=_checked_root_finder
     )
-    # Diffrax requires this field. See `_ARGUMENTS` for what it bounds.
+    # Diffrax requires this field. See `IMPLICIT_ARGUMENTS` for what it bounds.
     root_find_max_steps: int = eqx.field(
         default=100,
         kw_only=True,
@@ -338,9 +320,44 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
     )
 
 
-_Solver = TypeVar("_Solver", bound=type)
+def with_changed_stages(solver: Any, change: Callable[[Any], Any]) -> Any:
+    """The solver, with each solver in it (or itself) whose stage equations a `PicardNewton`
+    solves replaced by what `change` returns for it."""
 
-_ARGUMENTS = """**Arguments:** the parameters above, if any (Python numbers or strings), and
+    def change_if_possible(x: Any) -> Any:
+        if _is_implicit(x) and isinstance(x.root_finder, PicardNewton):
+            return change(x)
+        return x
+
+    return jtu.tree_map(change_if_possible, solver, is_leaf=_is_implicit)
+
+
+def has_newton(solver: Any) -> bool:
+    """Whether Newton's method solves steps that the sweeps of a `PicardNewton` do not, in
+    the solver or one in it."""
+    parts = jtu.tree_leaves(solver, is_leaf=_is_implicit)
+    finders = [x.root_finder for x in parts if _is_implicit(x)]
+    return any(isinstance(x, PicardNewton) and x.newton_steps > 0 for x in finders)
+
+
+def without_newton(solver: Any) -> Any:
+    """The solver, and all solvers in it, with a root finder that ends after its sweeps."""
+
+    def with_sweeps_alone(implicit_solver: Any) -> Any:
+        sweeps = dataclasses.replace(implicit_solver.root_finder, newton_steps=0)
+        return eqx.tree_at(lambda x: x.root_finder, implicit_solver, sweeps)
+
+    return with_changed_stages(solver, with_sweeps_alone)
+
+
+def _is_implicit(x: Any) -> bool:
+    return isinstance(x, AbstractImplicitStages)
+
+
+# Equinox makes an `__init__` for each class, without a docstring. This is that of solvers
+# with implicit stages.
+IMPLICIT_ARGUMENTS = """**Arguments:** the parameters above, if any (Python numbers or
+strings), and
 
 - `root_finder`: any Optimistix root finder for the stage equations.
 - `root_find_max_steps`: the most steps that a root finder of another package may take in
@@ -350,13 +367,6 @@ _ARGUMENTS = """**Arguments:** the parameters above, if any (Python numbers or s
 
 **Raises:** a `ValueError` for any other value.
 """
-
-
-def documented(solver: _Solver) -> _Solver:
-    """A decorator for solvers with implicit stages, which documents their arguments."""
-    # Equinox makes an `__init__` for each class, without a docstring.
-    solver.__init__.__doc__ = _ARGUMENTS
-    return solver
 
 
 def free_parameter(name: str, default: float) -> Any:

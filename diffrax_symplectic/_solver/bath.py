@@ -1,8 +1,7 @@
 """The step of friction and noise at fixed positions, by the implicit midpoint rule."""
 
 import functools as ft
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.flatten_util as jfu
@@ -64,13 +63,12 @@ def check_friction(
     p, q = y0
     t0 = jnp.asarray(t0, jnp.result_type(t0, jnp.float32))
 
+    def force(p: PyTree[Array]) -> PyTree[Array]:
+        friction_force, _ = rate(friction, t0, (p, q), args)
+        return friction_force
+
     def slope(p: PyTree[Array], change: PyTree[Array]) -> PyTree[Array]:
         """The derivative of the friction along a `change` of the momenta."""
-
-        def force(p: PyTree[Array]) -> PyTree[Array]:
-            friction_force, _ = rate(friction, t0, (p, q), args)
-            return friction_force
-
         _, derivative = jax.jvp(force, (p,), (change,))
         return derivative
 
@@ -102,7 +100,7 @@ def after_friction(
     h: RealScalarLike,
     y: tuple[PyTree[Array], PyTree[Array]],
     args: Args,
-    impulse: PyTree[Array] | None = None,
+    impulse: PyTree[Array],
 ) -> PyTree[Array]:
     r"""The momenta after friction and noise over `h`, with the impulse $B W$ of the noise:
     $p + x$ with $x = h F(p + x / 2) + B W$, where $F(p) = -G v(p)$ is linear in $p$.
@@ -117,12 +115,19 @@ def after_friction(
         friction_force, _ = rate(friction, t, (p, q), args)
         return friction_force
 
-    if impulse is None:
-        impulse = jtu.tree_map(jnp.zeros_like, p)
     # F(p + x / 2) = F(p) + S x / 2 with the slope S of F, so that
     # (1 - h S / 2) x = h F(p) + B W.
     if acts_elementwise(force, p):
-        return _after_own_friction(force, h, p, impulse)
+        # Each momentum has an equation of its own, and each force one slope, so that the
+        # derivative along ones is all of them.
+        ones = jtu.tree_map(jnp.ones_like, p)
+        forces, slopes = jax.jvp(force, (p,), (ones,))
+
+        def after_step(p: Array, force: Array, slope: Array, impulse: Array) -> Array:
+            step_size = jnp.asarray(h, jnp.result_type(p))
+            return p + (step_size * force + impulse) / (1 - step_size / 2 * slope)
+
+        return jtu.tree_map(after_step, p, forces, slopes, impulse)
     flat_p, unravel = jfu.ravel_pytree(p)
     flat_impulse, _ = jfu.ravel_pytree(impulse)
 
@@ -137,49 +142,19 @@ def after_friction(
     if flat_p.size > _MAX_SOLVED_IN_EACH_STEP:
         matrices = _matrices_if_constant(friction, t, y, args)
     if matrices is not None:
-        return unravel(flat_p + _solve_by_modes(matrices, step_size, matrix, rhs))
+        return unravel(flat_p + _solve_by_modes(*matrices, step_size, matrix, rhs))
     # Elimination in XLA operations takes a tenth of LAPACK's time for matrices this small.
     solve = eliminate if flat_p.size <= MAX_WRITTEN_OUT else jnp.linalg.solve
     return unravel(flat_p + solve(matrix, rhs))
 
 
-def _after_own_friction(
-    force: Callable[[PyTree[Array]], PyTree[Array]],
-    h: RealScalarLike,
-    p: PyTree[Array],
-    impulse: PyTree[Array],
-) -> PyTree[Array]:
-    """`after_friction` where the `force` on each momentum depends on this momentum alone:
-    one equation each."""
-    # Each force has one slope, by its own momentum, so the derivative along ones is all of
-    # them.
-    ones = jtu.tree_map(jnp.ones_like, p)
-    forces, slopes = jax.jvp(force, (p,), (ones,))
-
-    def after_step(p: Array, force: Array, slope: Array, impulse: Array) -> Array:
-        step_size = jnp.asarray(h, jnp.result_type(p))
-        return p + (step_size * force + impulse) / (1 - step_size / 2 * slope)
-
-    return jtu.tree_map(after_step, p, forces, slopes, impulse)
-
-
-class _Matrices(NamedTuple):
-    """The matrices of a step of friction, for momenta as a vector.
-
-    - `friction`: the friction on velocities, G.
-    - `inverse_masses`: the derivative of the velocities by the momenta, M^-1. In a solve
-        backward in time it has the other sign, as friction has.
-    """
-
-    friction: Float[Array, "n n"]
-    inverse_masses: Float[Array, "n n"]
-
-
 def _matrices_if_constant(
     friction: Terms, t: RealScalarLike, y: Y, args: Args
-) -> _Matrices | None:
-    """The matrices of the friction, or `None` unless they are known to be the same at all
-    times, momenta and positions."""
+) -> tuple[Float[Array, "n n"], Float[Array, "n n"]] | None:
+    """The friction on velocities, G, and the inverse masses M^-1, the derivative of the
+    velocities by the momenta, for momenta as a vector; `None` unless they are known to be
+    the same at all times, momenta and positions. In a solve backward in time the inverse
+    masses have the other sign, as friction has."""
     if len(friction) != 1:
         return None
     field = field_of(friction[0])
@@ -188,7 +163,7 @@ def _matrices_if_constant(
     p, q = y
     flat_p, unravel = jfu.ravel_pytree(p)
 
-    def matrices(t: Any, flat_p: Array, q: PyTree[Array]) -> _Matrices:
+    def matrices(t: Any, flat_p: Array, q: PyTree[Array]) -> tuple[Array, Array]:
         def force(flat_v: Array) -> Array:
             return jfu.ravel_pytree(field.force(t, q, args, unravel(flat_v)))[0]
 
@@ -198,24 +173,31 @@ def _matrices_if_constant(
         # The force is -G v, linear in v: its derivative is the same at every argument, of
         # which `flat_p` has the right shape.
         minus_G = jax.jacfwd(force)(flat_p)
-        return _Matrices(-minus_G, jax.jacfwd(velocity)(flat_p))
+        return -minus_G, jax.jacfwd(velocity)(flat_p)
 
     t = jnp.asarray(t, jnp.result_type(t, jnp.float32))
     dependence = Dependence(matrices, t, flat_p, q)
     if not dependence.independent(lambda t, flat_p, q: (t, flat_p, q)):
         return None
     G, inverse_masses = matrices(t, flat_p, q)
-    return _Matrices(G, direction(friction) * inverse_masses)
+    return G, direction(friction) * inverse_masses
 
 
 def _solve_by_modes(
-    matrices: _Matrices,
+    G: Float[Array, "n n"],
+    inverse_masses: Float[Array, "n n"],
     step_size: Float[Array, ""],
     matrix: Float[Array, "n n"],
     rhs: Float[Array, " n"],
 ) -> Float[Array, " n"]:
-    """The solution of `matrix @ x = rhs` for `matrix = 1 + step_size / 2 * G M^-1`, by the
+    r"""The solution of `matrix @ x = rhs` for `matrix = 1 + step_size / 2 * G M^-1`, by the
     modes of the constant matrices G and M^-1.
+
+    With $G = B B^\top$ these are the modes of the symmetric matrix $B^\top M^{-1} B$, with
+    the eigenvectors $U$ and the eigenvalues $D$, the rates at which they are damped. For $L
+    = B U$ and $R = L^\top M^{-1}$, $G M^{-1} = L R$ and $R L = D$. So by Woodbury's formula
+    the inverse of the matrix is $1 - \frac h2 L (1 + \frac h2 D)^{-1} R$. The change is
+    along the columns of $L$ only, so what the friction conserves is conserved.
 
     The modes are the same in all steps, while `matrix` changes with the rounding errors of
     `step_size`; derivatives are taken of the equation with `matrix`. The modes are computed
@@ -227,11 +209,15 @@ def _solve_by_modes(
     def multiply(x: Array) -> Array:
         return matrix @ x
 
-    def by_modes(rhs: Array) -> Array:
-        return _Modes.of(matrices).solve(step_size, rhs)
-
-    def by_modes_transposed(rhs: Array) -> Array:
-        return _Modes.of(matrices).transposed().solve(step_size, rhs)
+    def by_modes(rhs: Array, transposed: bool = False) -> Array:
+        root = semidefinite_root(G)
+        rates, vectors = jnp.linalg.eigh(root.T @ inverse_masses @ root)
+        left = root @ vectors
+        right = left.T @ inverse_masses
+        to_modes = left.T if transposed else right
+        from_modes = right.T if transposed else left
+        in_modes = (to_modes @ rhs) / (1 + step_size / 2 * rates)
+        return rhs - step_size / 2 * (from_modes @ in_modes)
 
     def solve(_: Any, rhs: Array) -> Array:
         by_matrix = ft.partial(jnp.linalg.solve, matrix)
@@ -239,41 +225,8 @@ def _solve_by_modes(
 
     def solve_transposed(_: Any, rhs: Array) -> Array:
         by_matrix = ft.partial(jnp.linalg.solve, matrix.T)
+        by_modes_transposed = ft.partial(by_modes, transposed=True)
         return lax.platform_dependent(rhs, cpu=by_modes_transposed, default=by_matrix)
 
     # Derivatives are taken of the equation. Those of eigenvectors may be infinite.
     return lax.custom_linear_solve(multiply, rhs, solve, solve_transposed)
-
-
-class _Modes(NamedTuple):
-    r"""The modes of a friction matrix $G = B B^\top$ for momenta with the masses $M$: those
-    of the symmetric matrix $B^\top M^{-1} B$.
-
-    - `left`: $B U$, with the eigenvectors $U$ as columns.
-    - `right`: $U^\top B^\top M^{-1}$, so that $G M^{-1}$ is `left @ right`.
-    - `rates`: the eigenvalues, the rates at which the modes are damped.
-    """
-
-    left: Float[Array, "n n"]
-    right: Float[Array, "n n"]
-    rates: Float[Array, " n"]
-
-    @staticmethod
-    def of(matrices: _Matrices) -> "_Modes":
-        """The modes of these matrices."""
-        root = semidefinite_root(matrices.friction)
-        rates, vectors = jnp.linalg.eigh(root.T @ matrices.inverse_masses @ root)
-        left = root @ vectors
-        return _Modes(left, left.T @ matrices.inverse_masses, rates)
-
-    def transposed(self) -> "_Modes":
-        return _Modes(self.right.T, self.left.T, self.rates)
-
-    def solve(self, step_size: Float[Array, ""], rhs: Float[Array, " n"]) -> Array:
-        r"""$(1 + \frac h2 G M^{-1})^{-1}$ times a vector, by Woodbury's formula: with the
-        matrices $L$ and $R$ of `left` and `right`, it is
-        $1 - \frac h2 L (1 + \frac h2 R L)^{-1} R$, where $R L$ is diagonal with the
-        entries `rates`. The change is along the columns of `left` only, so what the
-        friction conserves is conserved."""
-        in_modes = (self.right @ rhs) / (1 + step_size / 2 * self.rates)
-        return rhs - step_size / 2 * (self.left @ in_modes)

@@ -1,7 +1,7 @@
 """Solvers for any Hamiltonians that are not from Wang, Hong and Xu."""
 
 import dataclasses
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar
 
 import jax.flatten_util as jfu
 import jax.numpy as jnp
@@ -10,7 +10,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array
 
-from .._custom_types import Y
 from .._tableau import (
     drift_order,
     FlatTableau,
@@ -24,19 +23,17 @@ from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
     AbstractSymplecticSolver,
-    documented,
 )
 from .driven import drawn_variables, drift_change
 from .general import GAUSS, ImplicitMidpoint
 from .record import Record
-from .step import no_failure, Outcome, result_of, Step, take_step
+from .step import no_failure, result_of, Step, take_step
 from .times import result_with_times_checked
 
 
 _HALVES = np.array([1 / 2, 1 / 2])
 
 
-@documented
 class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""A symplectic method of weak order 2 for one noise or noises that commute: half a
     step of the drift by the midpoint rule, the noise by the Gauss method of order 4, and
@@ -96,22 +93,6 @@ _FLOW = make_plan(
 )
 
 
-class _Flow(NamedTuple):
-    """One flow of a splitting.
-
-    - `is_drift`: whether it is the flow of the drift, not of one noise.
-    - `t0`, `t1`: the times between which it moves; the same for noise.
-    - `noise_index`, `increment`: which noise, and its increment; ignored for the drift.
-    """
-
-    is_drift: Any
-    t0: Array
-    t1: Array
-    noise_index: Array
-    increment: Array
-
-
-@documented
 class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     r"""A symplectic method of weak order 2 for any Hamiltonians and any number of noises,
     whether they commute or not: splitting in random order.
@@ -175,51 +156,44 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         drift, noise = split_terms(terms)
         # A step has no state if it is called by itself, or by `diffrax.HalfSolver`.
         outcome = no_failure() if solver_state is None else solver_state
-        flows = self._flows(terms, t0, t1)
+        indices, increments = self._noises_in_order(terms, t0, t1)
+        # The drift moves to the middle of the step first, and from there to its end last.
+        # The noises between stay at the middle. Padding adds both drifts, which ignore the
+        # index and the increment of a noise.
+        middles = [t0 + (t1 - t0) / 2] * (indices.size + 1)
+        flows = (
+            # Whether it is the flow of the drift, not of one noise.
+            np.pad(np.full(indices.size, False), 1, constant_values=True),
+            # The times between which it moves.
+            jnp.stack([t0, *middles]),
+            jnp.stack([*middles, t1]),
+            jnp.pad(indices, 1),
+            jnp.pad(increments, 1),
+        )
 
-        def after_drift(flow: _Flow, y: Y, outcome: Outcome) -> tuple[Y, Outcome]:
+        def after_drift(t0, t1, index, increment, y, outcome):
             if len(drift) == 0:
                 return y, outcome
-            h = flow.t1 - flow.t0
-            change = drift_change(drift, flow.t0, flow.t1, args)
-            step = Step(flow.t0, h, {"h": change})
+            change = drift_change(drift, t0, t1, args)
+            step = Step(t0, t1 - t0, {"h": change})
             return take_step(_FLOW, step, y, self, outcome)
 
-        def after_noise(flow: _Flow, y: Y, outcome: Outcome) -> tuple[Y, Outcome]:
+        def after_noise(t0, t1, index, increment, y, outcome):
             if len(noise) == 0:
                 return y, outcome
-            change = jtu.Partial(
-                apply_one, noise, flow.noise_index, flow.increment, args
-            )
+            change = jtu.Partial(apply_one, noise, index, increment, args)
             # A step of size zero: time stands still, and `change` has the increment in it.
-            step = Step(flow.t0, jnp.zeros_like(flow.t0), {"h": change})
+            step = Step(t0, jnp.zeros_like(t0), {"h": change})
             return take_step(_FLOW, step, y, self, outcome)
 
-        def after_flow(carry, flow: _Flow):
-            y, outcome = carry
-            carry = lax.cond(flow.is_drift, after_drift, after_noise, flow, y, outcome)
-            return carry, None
+        def after_flow(carry, flow):
+            is_drift, *flow = flow
+            return lax.cond(is_drift, after_drift, after_noise, *flow, *carry), None
 
         # A loop compiles each kind of flow only once.
         (y1, outcome), _ = lax.scan(after_flow, (y0, outcome), flows)
         result = result_with_times_checked(terms, t0, t1, result_of(outcome, y1))
         return y1, None, dict(y0=y0, y1=y1), outcome, result
-
-    def _flows(self, terms, t0, t1) -> _Flow:
-        """All flows of a step, in order, stacked along a first axis."""
-        middle = t0 + (t1 - t0) / 2
-        indices, increments = self._noises_in_order(terms, t0, t1)
-        # The drift moves to the middle of the step first, and from there to its end last.
-        # The noises between stay at the middle. Padding adds both drifts, which ignore the
-        # index and the increment of a noise.
-        middles = [middle] * (indices.size + 1)
-        return _Flow(
-            is_drift=np.pad(np.full(indices.size, False), 1, constant_values=True),
-            t0=jnp.stack([t0, *middles]),
-            t1=jnp.stack([*middles, t1]),
-            noise_index=jnp.pad(indices, 1),
-            increment=jnp.pad(increments, 1),
-        )
 
     def _noises_in_order(self, terms, t0, t1) -> tuple[Array, Array]:
         """The indices of the noises in the order of their flows, and their increments."""
@@ -241,7 +215,6 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         return indices, increments[indices]
 
 
-@documented
 class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The implicit midpoint rule with Lévy areas: strong order 1 for any number of noises,
     whether they commute or not.
@@ -284,7 +257,6 @@ class LevyAreaMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     )
 
 
-@documented
 class PlateauGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""A symplectic method of strong order 3/2 for any Hamiltonians, with one noise or with
     noises that commute.

@@ -11,10 +11,8 @@ from jaxtyping import Array, Bool
 
 from .._arguments import check_pair
 from .._custom_types import Args, RealScalarLike, Y
-from .._terms import check_start, split_terms, Surface, without_constraint
+from .._terms import check_start, without_constraint
 from .base import AbstractSymplecticSolver
-from .driven import drawn_variables
-from .pieces import Flight, Kick, lengths_and_times, Moving, Setting
 from .step import no_failure
 
 
@@ -35,48 +33,6 @@ def init_constrained(
     outcome = R.where(is_off, R.nonlinear_divergence, no_failure())
     # With dependent constraints it is not known where the surface is, so this comes first.
     return R.where(is_dependent, R.singular, outcome)
-
-
-# Momenta and positions move as in the tableau of `StormerVerlet`.
-_VERLET = (Flight(1 / 2), Kick(1), Flight(1 / 2))
-
-
-def verlet_step(
-    terms: diffrax.AbstractTerm,
-    t0: RealScalarLike,
-    t1: RealScalarLike,
-    y0: Y,
-    args: Args,
-    last_outcome: optx.RESULTS,
-    solver_name: str,
-) -> tuple[Y, optx.RESULTS]:
-    """A step of [`diffrax_symplectic.StormerVerlet`][] on the surface, and the outcome of
-    all steps so far, which is the state of the solver. `last_outcome` is the outcome before
-    this step. `solver_name` is for errors about the path."""
-    surface = Surface.of(terms, t0, y0, args)
-    drift, noise = split_terms(without_constraint(terms))
-    variables = {"W": []}
-    if noise:
-        variables = drawn_variables(noise, ["W"], t0, t1, solver_name)
-    length, time = lengths_and_times(t0, t1)
-    setting = Setting(
-        kicks=drift,
-        rest=drift,
-        friction=(),
-        noise=noise,
-        increments=[variables["W"]],
-        args=args,
-        length=length,
-        time=time,
-        surface=surface,
-        # A path that failed before needs no multipliers: in a batch, others would wait.
-        pending=last_outcome == optx.RESULTS.successful,
-    )
-    moving = Moving(y0, forces=None, flows={})
-    for number, piece in enumerate(_VERLET):
-        moving = piece.move(setting, moving, number)
-    moving = moving.made_tangent(surface)
-    return end_and_outcome(moving.y, moving.found, last_outcome)
 
 
 def end_and_outcome(

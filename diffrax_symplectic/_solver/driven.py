@@ -1,11 +1,12 @@
 """The changes of the state that drive the stages of a step: by the drift over its length,
 and by the vector fields of the noise times the random variables that are drawn for it."""
 
+from collections.abc import Iterable
+
 import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 import jax.tree_util as jtu
-from jaxtyping import Array, PyTree
 
 from .._batch import materialize
 from .._brownian import (
@@ -15,6 +16,7 @@ from .._brownian import (
     GivenPath,
     Increment,
     is_random,
+    most_demanding_variable,
     PlateauBrownianPath,
     TruncatedBrownianPath,
     VARIABLES,
@@ -49,8 +51,14 @@ def noise_changes(
     change of the state over the step of size `h` from `t0` to `t1` by the vector fields
     that a variable multiplies. `drift` is the function of the drift stages, for variables
     that multiply brackets with it."""
-    required, optional = _attributes_for(names)
-    values = drawn_variables(noise, required, t0, t1, solver_name, tuple(optional))
+    # Variables are attributes of an increment, but for those that multiply the brackets of
+    # the drift: they are functions of `W`, `H` and, if the increment has it, `K`.
+    drawn = [name for name in names if drives(name) != "drift brackets"]
+    optional = []
+    if len(drawn) < len(names):
+        drawn = list(dict.fromkeys([*drawn, "W", "H"]))
+        optional = ["K"]
+    values = drawn_variables(noise, drawn, t0, t1, solver_name, optional)
     changes = {}
     for name in names:
         match drives(name):
@@ -74,30 +82,13 @@ def noise_changes(
     return changes
 
 
-def _attributes_for(names: list[str]) -> tuple[list[str], list[str]]:
-    """The attributes of an increment from which the random variables of these names are
-    computed: those that are required, and those that are used if they are there."""
-    required = []
-    optional = []
-    for name in names:
-        held = VARIABLES[name].held if name in VARIABLES else None
-        if held is None:
-            # Most variables are attributes themselves.
-            required.append(name)
-        else:
-            required += held.required
-            optional += held.optional
-    # Each is drawn once, although several variables may be computed from it.
-    return list(dict.fromkeys(required)), optional
-
-
 def drawn_variables(
     noise: Terms,
     names: list[str],
     t0: RealScalarLike,
     t1: RealScalarLike,
     solver_name: str,
-    optional: tuple[str, ...] = (),
+    optional: Iterable[str] = (),
 ) -> dict[str, list]:
     """The random variables of the step from `t0` to `t1`: for each name, one value for
     each noise term. The `optional` ones are left out unless all increments have them.
@@ -121,55 +112,38 @@ def drawn_variables(
     def all_have(name: str) -> bool:
         return all(getattr(x, name, None) is not None for x in increments)
 
-    # If several are missing, the message is about the one of highest rank: a path that has
-    # it also has those of lower rank.
-    for name in sorted(names, key=_rank, reverse=True):
-        if not all_have(name):
-            raise ValueError(f"`{solver_name}` needs {_how_to_get(name, noise)}.")
+    if missing := [name for name in names if not all_have(name)]:
+        raise ValueError(f"`{solver_name}` needs {_how_to_get(missing, noise)}.")
     variables = {}
     for name in [*names, *filter(all_have, optional)]:
-        variables[name] = [
-            _with_sign_restored(term, name, getattr(increment, name))
-            for term, increment in zip(noise, increments)
-        ]
+        values = [getattr(increment, name) for increment in increments]
+        if name in VARIABLES and VARIABLES[name].even:
+            # In a solve backward in time Diffrax negates all variables. Even ones must not
+            # change.
+            pairs = zip(noise, values)
+            values = [(direction(term) * value**ω).ω for term, value in pairs]
+        variables[name] = values
     return variables
 
 
-def _rank(name: str) -> int:
-    """The rank of a random variable. Those of the user's own solvers come last."""
-    return VARIABLES[name].rank if name in VARIABLES else -1
-
-
-def _how_to_get(name: str, noise: Terms) -> str:
-    """What a solver needs for this random variable, as the end of a sentence in a message:
-    "`SRKs4` needs ..."."""
-    variable = VARIABLES.get(name)
+def _how_to_get(missing: list[str], noise: Terms) -> str:
+    """What a solver needs for these random variables, as the end of a sentence in a
+    message: "`SRKs4` needs ..."."""
+    # If several are missing, the message is about the one of highest rank: a path that has
+    # it also has those of lower rank.
+    variable = most_demanding_variable(missing)
     if variable is None:
-        return f"increments with the attribute `{name}`"
-    fixed_paths = [path for path in brownian_paths(noise) if _is_fixed(path)]
-    if not fixed_paths:
-        return variable.advice
-    # Another path would be other noise, so that only another solver helps.
-    return (
-        f"{variable.name}, but `{type(fixed_paths[0]).__name__}` has no random key to draw "
-        "them from. Use a solver that needs only increments, such as `StormerVerlet` for "
-        "separable systems or `ImplicitMidpoint` for others"
-    )
-
-
-def _is_fixed(path: diffrax.AbstractBrownianPath) -> bool:
-    """Whether this is a path of the user's own without a random key, such as recorded
-    noise."""
-    return not is_random(path) and not isinstance(path, GivenPath)
-
-
-def _with_sign_restored(
-    term: diffrax.AbstractTerm, name: str, value: PyTree[Array]
-) -> PyTree[Array]:
-    """The `value` of a random variable with its own sign: in a solve backward in time
-    Diffrax negates all variables, and even ones must not change."""
-    is_even = name in VARIABLES and VARIABLES[name].even
-    return (direction(term) * value**ω).ω if is_even else value
+        return f"increments with the attribute `{missing[0]}`"
+    # Paths of the user's own without a random key, such as recorded noise. Another path
+    # would be other noise, so that only another solver helps.
+    for path in brownian_paths(noise):
+        if not is_random(path) and not isinstance(path, GivenPath):
+            return (
+                f"{variable.name}, but `{type(path).__name__}` has no random key to draw "
+                "them from. Use a solver that needs only increments, such as "
+                "`StormerVerlet` for separable systems or `ImplicitMidpoint` for others"
+            )
+    return variable.advice
 
 
 def _with_resolution_checked(
@@ -177,7 +151,9 @@ def _with_resolution_checked(
 ) -> RealScalarLike:
     """`t1`, with an error when run if a `VirtualBrownianTree` does not resolve the step."""
     step_size = jnp.abs(t1 - t0)
-    for path in map(_innermost, brownian_paths(noise)):
+    for path in brownian_paths(noise):
+        while isinstance(path, AbstractWrappedPath):
+            path = path.path
         if isinstance(path, diffrax.VirtualBrownianTree):
             tol = resolution(path)
             # Diffrax may take a last step of a rounding error, which has next to no noise:
@@ -191,13 +167,6 @@ def _with_resolution_checked(
                 "smaller `tol`, or for fixed steps `FixedStepBrownianPath(shape, key)`.",
             )
     return t1
-
-
-def _innermost(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
-    """The path within all wrappers."""
-    while isinstance(path, AbstractWrappedPath):
-        path = path.path
-    return path
 
 
 def _is_cheap(path: diffrax.AbstractBrownianPath) -> bool:

@@ -1,10 +1,9 @@
 """The flow of a fast linear part around the step of another solver."""
 
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import diffrax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, PyTree
 
 from .._arguments import check_pair, check_takes
 from .._compat import direction
@@ -21,17 +20,6 @@ from .base import AbstractSymplecticSolver
 from .flow import check_returns_pair, FlowFunction, returns_nan
 from .record import Order, Record
 from .splitting import AbstractLangevinSplitting
-
-
-class LinearFlowState(NamedTuple):
-    """What a `LinearFlow` hands on from the end of a step to the start of the next one.
-
-    - `solver`: the state of the solver for the rest.
-    - `is_broken`: whether the flow returned NaN at the start of the solve.
-    """
-
-    solver: PyTree[Array]
-    is_broken: Bool[Array, ""]
 
 
 # The end of each refusal: what to use in a heat bath.
@@ -115,12 +103,10 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
         )
 
     def weak_order(self, terms) -> int | None:
-        order = self.solver.weak_order(terms)
-        return None if order is None else min(order, self.weak)
+        return _at_most(self.solver.weak_order(terms), self.weak)  # pyright: ignore
 
     def strong_order(self, terms) -> int | float | None:
-        order: Any = self.solver.strong_order(terms)
-        return None if order is None else min(order, self.strong)
+        return _at_most(self.solver.strong_order(terms), self.strong)  # pyright: ignore
 
     @property
     def structure(self) -> Structure:
@@ -145,10 +131,9 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
     def stage_vectors(self, num_noises):
         return self.solver.stage_vectors(num_noises)
 
-    def order(self, terms):
-        order = self.solver.order(terms)
+    def order(self, terms):  # pyright: ignore
         # Strang's splitting has order 2.
-        return None if order is None else min(order, 2)
+        return _at_most(self.solver.order(terms), 2)
 
     def check(self, terms, t0, y0, args):
         check_pair(y0)
@@ -187,10 +172,12 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
         inner_state = self.solver.init(terms, t0, t1, y0, args)
         half = direction(terms) * (t1 - t0) / 2
         is_broken = returns_nan(self.flow, half, y0, args)
-        return LinearFlowState(inner_state, is_broken)
+        return inner_state, is_broken
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         del made_jump
+        # The state of the solver for the rest, and whether the flow returned NaN at the
+        # start of the solve.
         inner_state, is_broken = solver_state
         # Steps are positive even in a solve backward in time, where the flow runs back.
         half = direction(terms) * (t1 - t0) / 2
@@ -203,8 +190,7 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
         y1 = self.flow(half, y_after_step, args)
         R: Any = diffrax.RESULTS
         result = R.where(is_broken, R.nonfinite, result)
-        state = LinearFlowState(inner_state, is_broken)
-        return y1, error, dict(y0=y0, y1=y1), state, result
+        return y1, error, dict(y0=y0, y1=y1), (inner_state, is_broken), result
 
 
 def _at_most(order: Order | None, splitting_order: int) -> Order | None:

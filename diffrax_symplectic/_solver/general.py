@@ -8,13 +8,11 @@ from .._tableau import GeneralTableau
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
-    documented,
     free_parameter,
 )
 from .record import Record
 
 
-@documented
 class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The implicit midpoint rule for Stratonovich systems.
 
@@ -40,7 +38,6 @@ class ImplicitMidpoint(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     )
 
 
-@documented
 class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The two-stage symplectic methods SRKs1 of Wang, Hong and Xu.
 
@@ -76,7 +73,6 @@ class SRKs1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         return GeneralTableau.strong(A=A, B=A, alpha=alpha, beta=alpha)
 
 
-@documented
 class SRKw1(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The one-stage symplectic methods SRKw1 of Wang, Hong and Xu, of weak order 1.
 
@@ -122,7 +118,6 @@ _ROOT3 = np.sqrt(3)
 GAUSS = np.array([[1 / 4, 1 / 4 - _ROOT3 / 6], [1 / 4 + _ROOT3 / 6, 1 / 4]])
 
 
-@documented
 class SRKw2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic method SRKw2 of Wang, Hong and Xu, of weak order 2 for one noise.
 

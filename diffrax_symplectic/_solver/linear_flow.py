@@ -142,7 +142,11 @@ def _modes_of(
     is_known = not is_traced(K) and not is_traced(mass_roots)
     xp: Any = np if is_known else jnp
     if is_known:
-        _check_symmetric(K)
+        largest_entry = np.max(abs(K), initial=0)
+        if np.max(abs(K - K.T), initial=0) > _TOLERANCE * largest_entry:
+            raise ValueError(
+                "`stiffness` must be symmetric: it is a second derivative."
+            )
     root_of_each = xp.broadcast_to(xp.asarray(mass_roots), shape_of_q).reshape(-1)
     # The eigenvalues are the squares of the frequencies.
     eigenvalues, vectors = xp.linalg.eigh(K / root_of_each[:, None] / root_of_each)
@@ -156,13 +160,6 @@ def _modes_of(
     eigenvalues = xp.where(abs(eigenvalues) < rounding, 0.0, eigenvalues)
     # The root of a negative eigenvalue that is traced is NaN, which makes paths fail.
     return jnp.asarray(xp.sqrt(eigenvalues)), jnp.asarray(vectors)
-
-
-def _check_symmetric(K: Float[np.ndarray, "n n"]) -> None:
-    """Raises a `ValueError` unless the stiffness is symmetric up to rounding."""
-    largest_entry = np.max(abs(K), initial=0)
-    if np.max(abs(K - K.T), initial=0) > _TOLERANCE * largest_entry:
-        raise ValueError("`stiffness` must be symmetric: it is a second derivative.")
 
 
 def _to_modes(

@@ -33,37 +33,27 @@ def own_path(
 
 
 def common_path(
-    solver: diffrax.AbstractSolver, cell: float | None, shape: PyTree, key: PRNGKeyArray
-) -> diffrax.AbstractBrownianPath:
-    """A Gaussian path with the Lévy areas that the solver needs. With `cell`, a time of
-    which all steps are multiples, it is the same Brownian motion for all solvers."""
-    path = FixedStepBrownianPath(
-        shape, key, levy_area=diffrax.SpaceTimeLevyArea, cell=cell
-    )
-    return _with_areas_for(solver, path, cell, key)
-
-
-def path_of_array_cell(
-    solver: diffrax.AbstractSolver, cell: np.ndarray, shape: PyTree, key: PRNGKeyArray
-) -> diffrax.AbstractBrownianPath:
-    """`common_path` with a `cell` that is an array: another one compiles nothing anew, but
-    for solvers that need Lévy areas of pairs of noises."""
-    path = CommonBrownianPath(shape, key, cell)
-    return _with_areas_for(solver, path, float(cell), key)
-
-
-def _with_areas_for(
     solver: diffrax.AbstractSolver,
-    path: diffrax.AbstractBrownianPath,
-    cell: float | None,
+    cell: float | np.ndarray | None,
+    shape: PyTree,
     key: PRNGKeyArray,
 ) -> diffrax.AbstractBrownianPath:
-    """The path with the further variables that the solver needs."""
+    """A Gaussian path with the Lévy areas that the solver needs. With `cell`, a time of
+    which all steps are multiples, it is the same Brownian motion for all solvers. If it is
+    an array, another one compiles nothing anew, but for solvers that need Lévy areas of
+    pairs of noises."""
+    if isinstance(cell, np.ndarray):
+        path = CommonBrownianPath(shape, key, cell)
+    else:
+        path = FixedStepBrownianPath(
+            shape, key, levy_area=diffrax.SpaceTimeLevyArea, cell=cell
+        )
     increment = getattr(solver, "minimal_levy_area", diffrax.AbstractBrownianIncrement)
     if increment is PlateauIncrement:
         return PlateauBrownianPath(path, key)
-    if increment is LevyAreaIncrement:
-        # A step samples all of its cells, so these have no Fourier terms, which cost time.
-        num_terms = 2 if cell is None else 0
-        return LevyAreaBrownianPath(path, key, num_terms=num_terms, cell=cell)
-    return path
+    if increment is not LevyAreaIncrement:
+        return path
+    if cell is None:
+        return LevyAreaBrownianPath(path, key)
+    # A step samples all of its cells, so these have no Fourier terms, which cost time.
+    return LevyAreaBrownianPath(path, key, num_terms=0, cell=float(cell))

@@ -3,7 +3,7 @@
 import abc
 import functools as ft
 from collections.abc import Callable
-from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -15,9 +15,18 @@ from jax import lax
 from jaxtyping import Array, Bool, PyTree
 
 from .._arguments import whole_number
-from .._compat import direction, ω
+from .._compat import direction, unwrapped, wrapped_like, ω
 from .._custom_types import Args, RealScalarLike, Terms, Y
-from .._terms import apply, NormalSpace, rate, Surface
+from .._terms import (
+    apply,
+    constraint_of,
+    rate,
+    slow_apart,
+    split_friction,
+    Surface,
+    with_constraint,
+    without_constraint,
+)
 from .base import real_number
 from .bath import after_friction
 from .flow import (
@@ -28,12 +37,6 @@ from .flow import (
     returns_nan,
 )
 from .step import result_of
-
-
-if TYPE_CHECKING:
-    from typing import ClassVar as AbstractClassVar, ClassVar as AbstractVar
-else:
-    from equinox import AbstractClassVar, AbstractVar
 
 
 class Setting(NamedTuple):
@@ -60,27 +63,48 @@ class Setting(NamedTuple):
     length: Callable[[float], RealScalarLike]
     time: Callable[[float], RealScalarLike]
     surface: Surface | None = None
-    pending: Bool[Array, ""] | None = None
+    pending: Bool[Array, ""] | bool = True
 
 
-def lengths_and_times(
-    t0: RealScalarLike, t1: RealScalarLike
-) -> tuple[Callable[[float], RealScalarLike], Callable[[float], RealScalarLike]]:
-    """The functions `length` and `time` of a `Setting`, for a step from `t0` to `t1`. Equal
-    shares get the same array, which is computed once, and the end is exactly `t1`."""
+def kicks_and_rest(has_flow: bool, drift: Terms) -> tuple[Terms, Terms]:
+    """The terms whose forces are the kicks of a splitting, and the terms that its flow
+    follows, or free flight."""
+    # Kicks take the forces of the whole drift, and free flight its velocities.
+    if not has_flow:
+        return drift, drift
+    rest, slow = slow_apart(drift)
+    return slow, rest
+
+
+def setting_of(has_flow: bool, terms, t0, t1, y0: Y, args: Args) -> Setting:
+    """The setting of a step from `y0`, but for `increments` and `pending`, for terms with
+    the momentum first."""
+    drift, friction, noise = split_friction(without_constraint(terms))
+    kicks, rest = kicks_and_rest(has_flow, drift)
     h = t1 - t0
 
+    # Equal shares get the same array, which is computed once.
     @ft.cache
     def length(share: float) -> RealScalarLike:
         return h if share == 1 else share * h
 
     @ft.cache
     def time(share: float) -> RealScalarLike:
+        # The end is exactly `t1`.
         if share == 1:
             return t1
         return t0 if share == 0 else t0 + length(share)
 
-    return length, time
+    setting = Setting(kicks, rest, friction, noise, [], args, length, time)
+    constraint = constraint_of(terms)
+    if constraint is None:
+        return setting
+    # A solver that is the flow gets only the terms in `rest`, so one of them has to carry
+    # the constraint.
+    first, *others = rest
+    first = wrapped_like(first, with_constraint(unwrapped(first), constraint))
+    surface = Surface.of(terms, t0, y0, args)
+    return setting._replace(rest=(first, *others), surface=surface)
 
 
 class Moving(NamedTuple):
@@ -105,7 +129,7 @@ class Moving(NamedTuple):
     results: dict[int, diffrax.RESULTS] = {}
     elapsed: float = 0.0
     num_baths: int = 0
-    normal_space: NormalSpace | None = None
+    normal_space: Any = None
     is_tangent: bool = True
     found: Any = True
 
@@ -139,7 +163,7 @@ class Moving(NamedTuple):
             return self
         moving = self.with_normal_space(surface)
         p, unravel_p = jfu.ravel_pytree(self.y[0])
-        p = surface.tangent(p, moving.normal_space)  # pyright: ignore
+        p = surface.tangent(p, moving.normal_space)
         return moving._replace(y=(unravel_p(p), self.y[1]), is_tangent=True)
 
 
@@ -147,15 +171,12 @@ class AbstractPiece(eqx.Module):
     """A piece of a [`diffrax_symplectic.Splitting`][]: for `share` of the step it moves
     momenta, positions, or both."""
 
-    share: AbstractVar[float]
-    moves_positions: AbstractClassVar[bool]
+    moves_positions: ClassVar[bool] = False
+    share: float = eqx.field(static=True, converter=ft.partial(real_number, "share"))
 
     @abc.abstractmethod
     def move(self, setting: Setting, moving: Moving, number: int) -> Moving:
         """The state after this piece. `number` is that of the first piece that is alike."""
-
-
-_share = ft.partial(real_number, "share")
 
 
 class Kick(AbstractPiece):
@@ -168,19 +189,16 @@ class Kick(AbstractPiece):
     - `share`: the share of the step, a number.
     """
 
-    moves_positions: ClassVar[bool] = False
-    share: float = eqx.field(static=True, converter=_share)
-
     def move(self, setting, moving, number):
+        if not setting.kicks:
+            return moving
         p, q = moving.y
+        time = setting.time(moving.elapsed)
         forces = moving.forces
-        if setting.kicks:
-            if forces is None:
-                time = setting.time(moving.elapsed)
-                forces, _ = rate(setting.kicks, time, moving.y, setting.args)
-            p = _moved(p, setting.length(self.share), forces)
+        if forces is None:
+            forces, _ = rate(setting.kicks, time, moving.y, setting.args)
+        p = _moved(p, setting.length(self.share), forces)
         if setting.noise and not setting.friction:
-            time = setting.time(moving.elapsed)
             (increments,) = setting.increments
             impulse, _ = apply(setting.noise, increments, setting.args, time, moving.y)
             p = (p**ω + impulse**ω).ω
@@ -209,7 +227,6 @@ class Flight(AbstractPiece):
     """
 
     moves_positions: ClassVar[bool] = True
-    share: float = eqx.field(static=True, converter=_share)
 
     def move(self, setting, moving, number):
         length = setting.length(self.share)
@@ -248,7 +265,6 @@ class Flow(AbstractPiece):
     """
 
     moves_positions: ClassVar[bool] = True
-    share: float = eqx.field(static=True, converter=_share)
     flow: AnyFlow
     steps: int = eqx.field(
         default=1, static=True, converter=ft.partial(whole_number, "steps")
@@ -343,9 +359,6 @@ class Bath(AbstractPiece):
     **Raises:** a `ValueError` for any other share.
     """
 
-    moves_positions: ClassVar[bool] = False
-    share: float = eqx.field(static=True, converter=_share)
-
     def __check_init__(self):
         if self.share <= 0:
             raise ValueError(
@@ -360,48 +373,38 @@ class Bath(AbstractPiece):
         p, q = y
         time = setting.time(moving.elapsed)
         length = setting.length(self.share)
-        impulse = jtu.tree_map(jnp.zeros_like, p)
         if setting.noise:
             increments = setting.increments[moving.num_baths]
             impulse, _ = apply(setting.noise, increments, setting.args, time, y)
+        else:
+            impulse = jtu.tree_map(jnp.zeros_like, p)
 
         def after_bath(impulse: PyTree[Array]) -> PyTree[Array]:
-            """The momenta after friction, and an impulse spread over the length of it."""
-            return after_friction(
-                setting.friction, time, length, y, setting.args, impulse
-            )
+            """The momenta after friction, and an impulse spread over the length of it. It
+            is linear in the impulse, up to a constant."""
+            friction = setting.friction
+            return after_friction(friction, time, length, y, setting.args, impulse)
 
         if surface is None:
             p = after_bath(impulse)
         else:
-            p = _tangent_after_bath(surface, moving.normal_space, after_bath, impulse)
+            flat_impulse, unravel = jfu.ravel_pytree(impulse)
+
+            def flat_after_bath(impulse: Array) -> Array:
+                return jfu.ravel_pytree(after_bath(unravel(impulse)))[0]
+
+            # The impulses of the constraint forces, which make the momenta tangent, enter
+            # as that of the noise does, so that friction acts on them, too: then friction
+            # and noise are the midpoint rule within the tangent space, which keeps its
+            # Maxwell distribution.
+            def response(normal: Array) -> Array:
+                """The change of the momenta by a unit impulse along this normal."""
+                _, change_of_p = jax.jvp(flat_after_bath, (flat_impulse,), (normal,))
+                return change_of_p
+
+            flat_p = flat_after_bath(flat_impulse)
+            p = unravel(surface.tangent(flat_p, moving.normal_space, response))
         return moving._replace(y=(p, q), num_baths=moving.num_baths + 1)
-
-
-def _tangent_after_bath(
-    surface: Surface,
-    normal_space: NormalSpace | None,
-    after_bath: Callable[[PyTree[Array]], PyTree[Array]],
-    impulse: PyTree[Array],
-) -> PyTree[Array]:
-    """The momenta after friction, noise and those constraint forces that make them tangent
-    to the surface. `after_bath(impulse)` are the momenta after friction and an impulse, of
-    noise or constraint forces. It is linear in the impulse, up to a constant."""
-    flat_impulse, unravel = jfu.ravel_pytree(impulse)
-
-    def flat_after_bath(impulse: Array) -> Array:
-        return jfu.ravel_pytree(after_bath(unravel(impulse)))[0]
-
-    # The impulses of the constraint forces enter as that of the noise does, so that
-    # friction acts on them, too: then friction and noise are the midpoint rule within the
-    # tangent space, which keeps its Maxwell distribution.
-    def response(normal: Array) -> Array:
-        """The change of the momenta by a unit impulse along this normal."""
-        _, change_of_p = jax.jvp(flat_after_bath, (flat_impulse,), (normal,))
-        return change_of_p
-
-    p = flat_after_bath(flat_impulse)
-    return unravel(surface.tangent(p, normal_space, response))  # pyright: ignore
 
 
 def first_alike(pieces: tuple[AbstractPiece, ...]) -> tuple[int, ...]:

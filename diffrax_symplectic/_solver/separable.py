@@ -1,18 +1,20 @@
 """Solvers for H0 = V(p) + U(t, q) and noise Hamiltonians U_k(t, q)."""
 
-from typing import Any, ClassVar, get_args, Literal, NamedTuple, TypeAlias
+from typing import Any, ClassVar, get_args, Literal, TypeAlias
 
 import equinox as eqx
+import optimistix as optx
 
 from .._tableau import PartitionedTableau, SeparableTableau
 from .._terms import constraint_of
 from .base import (
     AbstractImplicitStages,
     AbstractSymplecticRungeKutta,
-    documented,
     free_parameter,
 )
-from .constrained import init_constrained, verlet_step
+from .constrained import end_and_outcome, init_constrained
+from .driven import drawn_variables
+from .pieces import Flight, Kick, Moving, setting_of
 from .record import Record
 from .step import Outcome, result_of
 from .times import result_with_times_checked
@@ -21,25 +23,17 @@ from .times import result_with_times_checked
 Variant: TypeAlias = Literal["a", "b", "c", "d", "e", "f"]
 
 
-class _Coefficients(NamedTuple):
-    """The coefficients of a one-stage method, besides `alpha = 1` and `A0 = 1 / 2`."""
-
-    beta: float
-    A1: float
-    B0: float
-
-
+# The coefficients beta, A1 and B0 of a one-stage method with `alpha = 1` and `A0 = 1 / 2`.
 _SRKW3 = {
-    "a": _Coefficients(beta=1, A1=1 / 2, B0=1 / 2),
-    "b": _Coefficients(beta=1, A1=1, B0=0),
-    "c": _Coefficients(beta=1, A1=0, B0=1),
-    "d": _Coefficients(beta=-1, A1=1 / 2, B0=-1 / 2),
-    "e": _Coefficients(beta=-1, A1=1, B0=0),
-    "f": _Coefficients(beta=-1, A1=0, B0=-1),
+    "a": (1, 1 / 2, 1 / 2),
+    "b": (1, 1, 0),
+    "c": (1, 0, 1),
+    "d": (-1, 1 / 2, -1 / 2),
+    "e": (-1, 1, 0),
+    "f": (-1, 0, -1),
 }
 
 
-@documented
 class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The one-stage symplectic methods SRKw3a to SRKw3f of Wang, Hong and Xu, of weak
     order 1, for $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
@@ -83,7 +77,6 @@ class SRKw3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         )
 
 
-@documented
 class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic methods SRKw4 of Wang, Hong and Xu, of weak order 2, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
@@ -127,7 +120,6 @@ class SRKw4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         )
 
 
-@documented
 class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic method SRKs2 of Wang, Hong and Xu, of strong order 1, for
     $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
@@ -152,7 +144,6 @@ class SRKs2(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     )
 
 
-@documented
 class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     r"""The symplectic methods SRKs3 of Wang, Hong and Xu, of strong order 1 for any
     number of noises, for $H_0 = V(p) + U_0(t, q)$ and $H_k = U_k(t, q)$.
@@ -187,6 +178,10 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         alpha = [2 * self.a, 1 - 2 * self.a]
         # The positions at the noise are those at the end of the step: its row is `alpha`.
         return SeparableTableau(alpha=alpha, beta=[1], A0=A0, B0=[[0], [0]], A1=[alpha])
+
+
+# The tableau of `StormerVerlet` in pieces, whose flights keep a constraint.
+_CONSTRAINED_STEP = (Flight(1 / 2), Kick(1), Flight(1 / 2))
 
 
 class StormerVerlet(AbstractSymplecticRungeKutta):
@@ -243,9 +238,19 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         if constraint_of(terms) is None:
             return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
-        y1, outcome = verlet_step(
-            terms, t0, t1, y0, args, solver_state, type(self).__name__
-        )
+        setting = setting_of(False, terms, t0, t1, y0, args)
+        increments = []
+        if setting.noise:
+            name = type(self).__name__
+            increments = drawn_variables(setting.noise, ["W"], t0, t1, name)["W"]
+        # A path that failed before needs no multipliers: in a batch, others would wait.
+        pending = solver_state == optx.RESULTS.successful
+        setting = setting._replace(increments=[increments], pending=pending)
+        moving = Moving(y0, forces=None, flows={})
+        for number, piece in enumerate(_CONSTRAINED_STEP):
+            moving = piece.move(setting, moving, number)
+        moving = moving.made_tangent(setting.surface)  # pyright: ignore
+        y1, outcome = end_and_outcome(moving.y, moving.found, solver_state)
         result = result_with_times_checked(terms, t0, t1, result_of(outcome, y1))
         return y1, None, dict(y0=y0, y1=y1), outcome, result
 

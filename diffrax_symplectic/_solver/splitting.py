@@ -6,14 +6,12 @@ from typing import Any, ClassVar, NamedTuple, TYPE_CHECKING
 
 import diffrax
 import equinox as eqx
-import jax.numpy as jnp
-import jax.tree_util as jtu
 import optimistix as optx
 from jax import lax
 from jaxtyping import Array, PyTree
 
 from .._arguments import check_state
-from .._compat import unwrapped, wrapped_like
+from .._compat import unwrapped, ω
 from .._custom_types import Args, Terms, Y
 from .._tableau import Structure
 from .._terms import (
@@ -21,11 +19,7 @@ from .._terms import (
     constraint_of,
     momentum_first,
     rate,
-    slow_apart,
     split_friction,
-    Surface,
-    with_constraint,
-    without_constraint,
 )
 from .base import AbstractSymplecticSolver
 from .bath import check_friction
@@ -39,9 +33,9 @@ from .pieces import (
     Flight,
     Flow,
     Kick,
-    lengths_and_times,
+    kicks_and_rest,
     Moving,
-    Setting,
+    setting_of,
 )
 from .record import Record
 from .step import result_of
@@ -65,16 +59,6 @@ class SplittingState(NamedTuple):
     forces: PyTree[Array]
     flows: dict[int, PyTree[Array]]
     outcome: optx.RESULTS | None
-
-
-def kicks_and_rest(has_flow: bool, drift: Terms) -> tuple[Terms, Terms]:
-    """The terms whose forces are the kicks of a splitting, and the terms that its flow
-    follows, or free flight."""
-    # Kicks take the forces of the whole drift, and free flight its velocities.
-    if not has_flow:
-        return drift, drift
-    rest, slow = slow_apart(drift)
-    return slow, rest
 
 
 class AbstractLangevinSplitting(AbstractSymplecticSolver):
@@ -177,7 +161,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         else:
             self.check(terms, t0, y0, args)
         terms, y0 = momentum_first(terms, y0)
-        setting = self._setting(terms, t0, t1, y0, args)
+        setting = setting_of(self.has_flow, terms, t0, t1, y0, args)
         forces = None
         if self.kicks_at_ends and setting.kicks:
             forces, _ = rate(setting.kicks, t0, y0, args)
@@ -186,23 +170,6 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
             for number, piece in self._flows.items()
         }
         return SplittingState(forces, flows, outcome)
-
-    def _setting(self, terms, t0, t1, y0, args) -> Setting:
-        """What the pieces of a step from `y0` have in common, but for the increments, for
-        terms with the momentum first."""
-        drift, friction, noise = split_friction(without_constraint(terms))
-        kicks, rest = kicks_and_rest(self.has_flow, drift)
-        constraint = constraint_of(terms)
-        times = lengths_and_times(t0, t1)
-        setting = Setting(kicks, rest, friction, noise, [], args, *times)
-        if constraint is None:
-            return setting
-        # A solver that is the flow gets only the terms in `rest`, so one of them has to
-        # carry the constraint.
-        first, *others = rest
-        first = wrapped_like(first, with_constraint(unwrapped(first), constraint))
-        surface = Surface.of(terms, t0, y0, args)
-        return setting._replace(rest=(first, *others), surface=surface)
 
     def _increments(self, noise: Terms, t0, t1) -> list[list]:
         """For each bath the increments of its share of the step, one for each noise."""
@@ -218,19 +185,9 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         # both is (s (1 - s) - w^2 / 12) h = 0.
         share, _ = [bath.share for bath in self._baths]
         weight = math.sqrt(12 * share * (1 - share))
-
-        def first_part(W: Array, H: Array) -> Array:
-            return share * W + weight * H
-
-        first = [
-            jtu.tree_map(first_part, W, H)
-            for W, H in zip(variables["W"], variables["H"])
-        ]
-        second = [
-            jtu.tree_map(jnp.subtract, W, part)
-            for W, part in zip(variables["W"], first)
-        ]
-        return [first, second]
+        W = variables["W"]
+        first = (share * W**ω + weight * variables["H"] ** ω).ω
+        return [first, (W**ω - first**ω).ω]
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         # The user's own terms and state: those of Diffrax have the state (x, v).
@@ -238,7 +195,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         own_y0 = y0
         terms, y0 = momentum_first(own_terms, own_y0)
         forces, flows, outcome = solver_state
-        setting = self._setting(terms, t0, t1, y0, args)
+        setting = setting_of(self.has_flow, terms, t0, t1, y0, args)
         increments = self._increments(setting.noise, t0, t1)
         setting = setting._replace(increments=increments)
         if setting.surface is not None:

@@ -2,7 +2,7 @@
 implicit differentiation."""
 
 import functools as ft
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple, TypeAlias
 
 import diffrax
@@ -18,7 +18,7 @@ from .._batch import batched_like, materialize
 from .._compat import dce_jaxpr, Jaxpr, programs_in, ω
 from .._custom_types import RealScalarLike, Y
 from .._root_finder import all_finite, differentiate, Halves
-from .._tableau import Block, FlatTableau, Group, Stage, StepPlan
+from .._tableau import Block, Group, Stage, StepPlan
 from .._terms import tree_sum
 
 
@@ -27,9 +27,9 @@ from .._terms import tree_sum
 _Value: TypeAlias = PyTree[Array]
 # The values of the stages known so far, by stage number.
 KnownValues: TypeAlias = dict[int, _Value]
-# The values of the unknown stages: for each block, for each of its groups. In the comments
-# and root finders these are the unknowns k.
-Unknown: TypeAlias = list[list[_Value]]
+# The values of the unknown stages, by group. In the comments and root finders these are the
+# unknowns k.
+Unknown: TypeAlias = dict[Group, _Value]
 # The halves of a change are computed together if one by one they take more than so many
 # times the operations: 2 times if they share all of them, once if they share none. Then
 # sweeps over a doubled system cost about the same and are fewer. For a qubit under
@@ -64,20 +64,37 @@ class Stages(eqx.Module):
     # Whether sweeps may update momenta and positions one after the other.
     in_halves: bool = eqx.field(static=True, default=True)
 
-    def zeros_for(self, block: Block) -> list[_Value]:
-        """Zeros for the unknown stages of a block, as a guess."""
+    def _start(self, group: Group) -> PyTree[Array]:
+        """The part of the state at the start of the step that these stages change."""
+        return _part(self.y0, self.plan.tableau.stages[group[0]].writes)
 
-        def zero_value(group: Group) -> _Value:
-            first = self.plan.tableau.stages[group[0]]
+    def zeros(self) -> Unknown:
+        """Zeros for the unknown values, as a guess."""
+
+        def zeros_for(group: Group) -> _Value:
             # The value of one stage alone is not stacked.
             stacked_axis = (len(group),) if len(group) > 1 else ()
 
             def zeros(x: Array) -> Array:
                 return jnp.zeros((*stacked_axis, *jnp.shape(x)), jnp.result_type(x))
 
-            return jtu.tree_map(zeros, _part(self.y0, first.writes))
+            return jtu.tree_map(zeros, self._start(group))
 
-        return [zero_value(group) for group in block.unknown]
+        groups = [group for block in self.plan.blocks for group in block.unknown]
+        return {group: zeros_for(group) for group in groups}
+
+    def scale(self, unknown: Unknown) -> Unknown:
+        """The size of the state that unknown values change, which sets their tolerance."""
+
+        def size(y: Array, value: Array) -> Array:
+            # At rest the state may be zero, and the value alone is the scale. The state
+            # broadcasts against the values of several stages.
+            return jnp.abs(y) + jnp.abs(value)
+
+        return {
+            group: jtu.tree_map(size, self._start(group), value)
+            for group, value in unknown.items()
+        }
 
     def solve_blocks(
         self, solve: Callable, guess: Unknown, pending: Bool[Array, ""]
@@ -86,18 +103,17 @@ class Stages(eqx.Module):
         of earlier blocks; and whether all blocks are solved. `solve` is called as
         `solve(image, scale, guess, pending)` and returns these for one block."""
         known: KnownValues = {}
-        unknown = []
+        unknown: Unknown = {}
         all_solved = jnp.array(True)
-        for block, guess_of_block in zip(self.plan.blocks, guess):
-            # Of an explicit block nothing is unknown: its guess has no values.
-            solution = guess_of_block
+        for block in self.plan.blocks:
+            # Of an explicit block nothing is unknown.
             if block.unknown:
                 solution, block_solved = self._solve_block(
-                    block, known, solve, guess_of_block, pending
+                    block, known, solve, guess, pending
                 )
+                unknown = unknown | solution
                 all_solved = all_solved & block_solved
-            unknown.append(solution)
-            known = self._with_block(block, known, solution, stores_shared=True)
+            known = self._with_block(block, known, unknown, stores_shared=True)
         return unknown, all_solved
 
     def _solve_block(
@@ -105,26 +121,32 @@ class Stages(eqx.Module):
         block: Block,
         known: KnownValues,
         solve: Callable,
-        guess: list[_Value],
+        guess: Unknown,
         pending: Bool[Array, ""],
-    ) -> tuple[list[_Value], Bool[Array, ""]]:
+    ) -> tuple[Unknown, Bool[Array, ""]]:
         """The unknown values of one block, and whether they solve its equations."""
+        guess = {group: guess[group] for group in block.unknown}
         # For values that are pairs (p, q), sweeps update all momenta, then all positions.
-        are_pairs = self.in_halves and all(map(_is_pair, guess))
+        are_pairs = self.in_halves and all(map(_is_pair, guess.values()))
 
-        # From [(p_1, q_1), (p_2, q_2), ...] to ((p_1, p_2, ...), (q_1, q_2, ...)).
-        def in_halves(values: list[_Value]) -> Any:
-            return Halves(*zip(*values)) if are_pairs else values
+        def in_halves(values: Unknown) -> Any:
+            if not are_pairs:
+                return values
+            momenta = {group: p for group, (p, _) in values.items()}
+            positions = {group: q for group, (_, q) in values.items()}
+            return Halves(momenta, positions)
 
-        # The inverse of `in_halves`.
-        def by_group(halves: Any) -> list[_Value]:
-            return [*zip(*halves)] if are_pairs else halves
+        def by_group(halves: Any) -> Unknown:
+            if not are_pairs:
+                return halves
+            return {group: (halves.p[group], halves.q[group]) for group in halves.p}
 
         def image(halves: Any) -> Any:
-            return in_halves(self._image_of_block(block, known, by_group(halves)))
+            known_with_block = self._with_block(block, known, by_group(halves))
+            return in_halves(self._values(block.unknown, known_with_block))
 
         def scale(halves: Any) -> Any:
-            return in_halves(self._scale_of_block(block, by_group(halves)))
+            return in_halves(self.scale(by_group(halves)))
 
         solution, is_solved = solve(image, scale, in_halves(guess), pending)
         return by_group(solution), is_solved
@@ -132,101 +154,74 @@ class Stages(eqx.Module):
     def image(self, unknown: Unknown) -> Unknown:
         r"""The values $\Phi(k)$ that the stage equations of the whole step give to its
         unknown stages, if they have the values $k$. A solution is a fixed point."""
-        known: KnownValues = {}
-        image = []
-        for block, unknown_of_block in zip(self.plan.blocks, unknown):
-            image.append(self._image_of_block(block, known, unknown_of_block))
-            known = self._with_block(block, known, unknown_of_block)
-        return image
+        return self._values(unknown, self._known(unknown))
 
-    def _image_of_block(
-        self, block: Block, known: KnownValues, unknown_of_block: list[_Value]
-    ) -> list[_Value]:
-        """`image` for the unknown values of one block, with the known values of earlier
-        blocks."""
-        known_with_block = self._with_block(block, known, unknown_of_block)
-        return [
-            self._evaluate_group(group, known_with_block) for group in block.unknown
-        ]
+    def end(self, unknown: Unknown) -> Y:
+        """The state at the end of the step, from the values of its unknown stages."""
+        tableau = self.plan.tableau
+        known = self._known(unknown, stores_shared=True)
+        return _position(self.y0, tableau.stages, tableau.weights[None], known)
+
+    def _values(self, groups: Iterable[Group], known: KnownValues) -> Unknown:
+        """The values of these stages, at positions by the known ones."""
+        return {group: self._evaluate(group, known) for group in groups}
+
+    def _known(self, unknown: Unknown, stores_shared: bool = False) -> KnownValues:
+        """The values of all stages, from those of the unknown ones."""
+        known: KnownValues = {}
+        for block in self.plan.blocks:
+            known = self._with_block(block, known, unknown, stores_shared)
+        return known
 
     def _with_block(
         self,
         block: Block,
         known: KnownValues,
-        unknown_of_block: list[_Value],
+        unknown: Unknown,
         stores_shared: bool = False,
     ) -> KnownValues:
-        """`known` with all stages of a block added: its unknown stages have the values
-        `unknown_of_block`, its explicit stages are evaluated from these. With
-        `stores_shared`, an explicit value that enters several positions is stored, so that
-        XLA does not compute it again for each."""
+        """`known` with all stages of a block added: its unknown stages have the values in
+        `unknown`, its explicit stages are evaluated from these. With `stores_shared`, an
+        explicit value that enters several positions is stored, so that XLA does not compute
+        it again for each."""
         # Each `|` makes a new dictionary, and the caller's stays as it is: the root finder
         # traces an iteration more than once, from the same known values.
-        for group, value in zip(block.unknown, unknown_of_block):
-            known = known | _unstack(group, value)
+        for group in block.unknown:
+            known = known | _unstack(group, unknown[group])
+        # A row for each position, and one for the end; a column for each stage.
+        tableau = self.plan.tableau
+        coefficients = np.vstack([tableau.matrix, tableau.weights])
         for group in block.explicit:
-            evaluate = ft.partial(self._evaluate_group, group, known)
+            evaluate = ft.partial(self._evaluate, group, known)
+            num_uses = np.count_nonzero(coefficients[:, list(group)].any(axis=1))
             # Within an iteration, storing a value costs as much as computing it again.
-            is_stored = stores_shared and _num_uses(self.plan.tableau, group) > 1
+            is_stored = stores_shared and num_uses > 1
             value = materialize(evaluate) if is_stored else evaluate()
             known = known | _unstack(group, value)
         return known
 
-    def end(self, unknown: Unknown) -> Y:
-        """The state at the end of the step, from the values of its unknown stages."""
-        tableau = self.plan.tableau
-        known: KnownValues = {}
-        for block, unknown_of_block in zip(self.plan.blocks, unknown):
-            known = self._with_block(block, known, unknown_of_block, stores_shared=True)
-        return _position(self.y0, tableau.stages, tableau.weights[None], known)
-
-    def scale(self, unknown: Unknown) -> Unknown:
-        """The size of the state that unknown values change, which sets their tolerance."""
-        return [
-            self._scale_of_block(block, unknown_of_block)
-            for block, unknown_of_block in zip(self.plan.blocks, unknown)
-        ]
-
-    def _scale_of_block(
-        self, block: Block, unknown_of_block: list[_Value]
-    ) -> list[_Value]:
-        """`scale` for the unknown values of one block."""
-
-        def size(y: Array, value: Array) -> Array:
-            # At rest the state may be zero, and the value alone is the scale. The state
-            # broadcasts against the values of several stages.
-            return jnp.abs(y) + jnp.abs(value)
-
-        def scale_of_group(group: Group, value: _Value) -> _Value:
-            # All stages of a group write the same part.
-            first = self.plan.tableau.stages[group[0]]
-            return jtu.tree_map(size, _part(self.y0, first.writes), value)
-
-        return [
-            scale_of_group(group, value)
-            for group, value in zip(block.unknown, unknown_of_block)
-        ]
-
-    def _evaluate_group(self, group: Group, known: KnownValues) -> _Value:
+    def _evaluate(self, group: Group, known: KnownValues) -> _Value:
         """The values of stages of one kind, stacked unless there is only one."""
         tableau = self.plan.tableau
         rows = tableau.matrix[list(group)]
         position = _position(self.y0, tableau.stages, rows, known)
-        return _evaluate(self.step, [tableau.stages[i] for i in group], position)
+        stages = [tableau.stages[i] for i in group]
+        first = stages[0]
 
+        def value(c: RealScalarLike, y: Y) -> _Value:
+            t = self.step.t0 + c * self.step.h
+            changes = [self.step.changes[name](t, y) for name in first.channels]
+            return _part(tree_sum(changes), first.writes)
 
-def with_explicit_arrays(step: Step, y0: Y) -> Step:
-    """The same step, with the arrays that its functions capture as leaves of the PyTree, so
-    that derivatives with respect to these are seen. Each function is traced once, here."""
-    # Converted functions accept only the types that they were traced for.
-    dtype = jnp.result_type(step.t0, step.h, float)
-    t0 = jnp.asarray(step.t0, dtype)
-    h = jnp.asarray(step.h, dtype)
-    changes = {
-        name: eqx.filter_closure_convert(change, t0, y0)
-        for name, change in step.changes.items()
-    }
-    return Step(t0, h, changes)
+        if len(stages) == 1:
+            return value(first.c, position)
+        # `vmap` keeps the compiled code as small as for one evaluation.
+        fractions = [stage.c for stage in stages]
+        if len(set(fractions)) == 1:
+            # With one time for all, what depends on time alone is computed once.
+            return jax.vmap(value, in_axes=(None, 0))(first.c, position)
+        times = jnp.asarray(fractions, jnp.result_type(self.step.h, float))
+        return jax.vmap(value)(times, position)
 
 
 def _is_pair(y: Y) -> bool:
@@ -266,15 +261,6 @@ def _num_operations(program: Jaxpr) -> int:
     return len(program.eqns) + sum(map(_num_operations, inner))
 
 
-def _num_uses(tableau: FlatTableau, group: Group) -> int:
-    """The number of positions that the values of `group` enter, including the end of the
-    step."""
-    # A row for each position, a column for each stage.
-    coefficients = np.vstack([tableau.matrix, tableau.weights])
-    is_used = coefficients[:, list(group)].any(axis=1)
-    return int(np.count_nonzero(is_used))
-
-
 def _unstack(group: Group, value: _Value) -> KnownValues:
     """The values of a group by stage number, from its stacked `value`."""
     if len(group) == 1:
@@ -284,25 +270,6 @@ def _unstack(group: Group, value: _Value) -> KnownValues:
         number: jtu.tree_map(lambda stacked: stacked[row], value)
         for row, number in enumerate(group)
     }
-
-
-def _evaluate(step: Step, stages: list[Stage], y: Y) -> _Value:
-    """The values of stages of one kind at their positions `y`."""
-    first = stages[0]
-
-    def value(c: RealScalarLike, y: Y) -> _Value:
-        t = step.t0 + c * step.h
-        change = tree_sum([step.changes[name](t, y) for name in first.channels])
-        return _part(change, first.writes)
-
-    if len(stages) == 1:
-        return value(first.c, y)
-    # `vmap` keeps the compiled code as small as for one evaluation.
-    fractions = [stage.c for stage in stages]
-    if len(set(fractions)) == 1:
-        # With one time for all, what depends on time alone is computed once.
-        return jax.vmap(value, in_axes=(None, 0))(first.c, y)
-    return jax.vmap(value)(jnp.asarray(fractions, jnp.result_type(step.h, float)), y)
 
 
 def _part(y: PyTree, part: str) -> PyTree:
@@ -373,9 +340,8 @@ def take_step(
 ) -> tuple[Y, Outcome]:
     """The end of the step, and whether its stage equations were solved, by the root finder
     of `solver`. A path that failed before, by its `last_outcome`, is skipped."""
-    if plan.num_unknown == 0:
-        no_unknown: Unknown = [[] for _ in plan.blocks]
-        return Stages(plan, step, y0).end(no_unknown), last_outcome
+    if not any(block.unknown for block in plan.blocks):
+        return Stages(plan, step, y0).end({}), last_outcome
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
         raise ValueError(
             f"The tableau of `{type(solver).__name__}` has implicit stages. Let the class "
@@ -417,7 +383,17 @@ def _jitted_implicit_step(
     max_steps: int,
 ) -> tuple[Y, optx.RESULTS]:
     """The end of the step, and whether its stage equations were solved."""
-    step = with_explicit_arrays(step, y0)
+    # The arrays that the functions of the step capture become leaves of a PyTree, so that
+    # derivatives with respect to these are seen. Converted functions accept only the types
+    # that they were traced for.
+    dtype = jnp.result_type(step.t0, step.h, float)
+    t0 = jnp.asarray(step.t0, dtype)
+    h = jnp.asarray(step.h, dtype)
+    changes = {
+        name: eqx.filter_closure_convert(change, t0, y0)
+        for name, change in step.changes.items()
+    }
+    step = Step(t0, h, changes)
     in_halves = not _computes_halves_together(step, y0)
     stages = Stages(plan, step, y0, in_halves)
     y1, _, outcome = _implicit_step(
@@ -439,8 +415,8 @@ def _implicit_step(
             "which does not solve the stage equations. Pass the root finder that it wraps."
         )
     failed_before = _failed(last_outcome)
-    guess = [stages.zeros_for(block) for block in stages.plan.blocks]
-    guess, failed_before = batched_like((guess, failed_before), (stages, last_outcome))
+    inputs = stages, last_outcome
+    guess, failed_before = batched_like((stages.zeros(), failed_before), inputs)
     # With NaN as the guess, the root finder stops at once for a path that failed before.
     guess = jtu.tree_map(lambda k: jnp.where(failed_before, jnp.nan, k), guess)
     sol = optx.root_find(

@@ -4,6 +4,7 @@ import dataclasses
 import functools as ft
 import itertools
 from collections.abc import Mapping
+from typing import Any, NoReturn
 
 import numpy as np
 from jaxtyping import Float
@@ -144,11 +145,17 @@ def drift_order(tableau: FlatTableau) -> int:
     return len(conditions)
 
 
-@ft.singledispatch
-def _strong_conditions(tableau: AbstractTableau) -> dict:
-    """The residuals of the conditions for the strong order of the tableau's family, by
-    formula."""
-    raise _unknown_tableau(tableau)
+def _unknown_tableau(tableau: AbstractTableau) -> NoReturn:
+    raise ValueError(
+        "The conditions are known for `GeneralTableau`, `SeparableTableau`, "
+        f"`PartitionedTableau` and `AdditiveTableau`; got `{type(tableau).__name__}`."
+    )
+
+
+# The residuals of the conditions for the strong order of a tableau's family, by formula;
+# and those for its weak orders: for order 1, and those that order 2 needs beside them.
+_strong_conditions: Any = ft.singledispatch(_unknown_tableau)
+_weak_conditions: Any = ft.singledispatch(_unknown_tableau)
 
 
 @_strong_conditions.register
@@ -198,13 +205,6 @@ def _(tableau: AdditiveTableau) -> dict:
         "beta[W].c1 - 1/2": tableau.beta["W"] @ c1 - 1 / 2,
         "beta[H].c1 + 1": beta_H @ c1 + 1,
     }
-
-
-@ft.singledispatch
-def _weak_conditions(tableau: AbstractTableau) -> tuple[dict, dict]:
-    """The residuals of the conditions for the weak orders of the tableau's family, by
-    formula: those for order 1, and those that order 2 needs beside them."""
-    raise _unknown_tableau(tableau)
 
 
 @_weak_conditions.register
@@ -376,13 +376,6 @@ def _variance(name: str) -> float:
             "of any solver use `weak_order_defect`."
         )
     return _VARIANCES[name]
-
-
-def _unknown_tableau(tableau: AbstractTableau) -> ValueError:
-    return ValueError(
-        "The conditions are known for `GeneralTableau`, `SeparableTableau`, "
-        f"`PartitionedTableau` and `AdditiveTableau`; got `{type(tableau).__name__}`."
-    )
 
 
 # The channels whose controls change sign when a step is reversed.

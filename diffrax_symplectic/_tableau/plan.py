@@ -53,11 +53,6 @@ class StepPlan:
     tableau: FlatTableau
     blocks: tuple[Block, ...]
 
-    @property
-    def num_unknown(self) -> int:
-        """The number of stage vectors to solve for in one step."""
-        return sum(len(group) for block in self.blocks for group in block.unknown)
-
 
 def make_plan(tableau: FlatTableau) -> StepPlan:
     """The plan of a step: unused stages are dropped, equal ones merged, and the rest is

@@ -160,24 +160,19 @@ class AbstractTableau(abc.ABC):
         """All stages of the tableau, including unused ones, as one matrix."""
 
 
-def _variables(*coefficients: Mapping[str, np.ndarray]) -> list[str]:
-    """The names of all random variables that have coefficients in one of these
-    dictionaries, in order of first appearance."""
-    names = [name for by_variable in coefficients for name in by_variable]
-    # A dictionary keeps this order. The order of a set would differ from run to run.
-    return list(dict.fromkeys(names))
-
-
 def _side_by_side(
-    coefficients: Mapping[str, np.ndarray],
-    variables: list[str],
-    shape: tuple[int, ...],
-) -> Float[np.ndarray, "..."]:
-    """The coefficients of each of these random variables, of this `shape` each,
-    concatenated along the last axis. Variables without coefficients have zeros."""
+    B: Mapping[str, np.ndarray], beta: Mapping[str, np.ndarray], shape: tuple[int, int]
+) -> tuple[list[str], Float[np.ndarray, "s n"], Float[np.ndarray, " n"]]:
+    """The names of all random variables that have coefficients in `B`, of this `shape`, or
+    `beta`; and the coefficients of all of them, concatenated along the last axis. Variables
+    without coefficients have zeros."""
+    # A dictionary keeps the order of first appearance. That of a set would differ from run
+    # to run.
+    variables = list(dict.fromkeys([*B, *beta]))
     zeros = np.zeros(shape)
-    arrays = [coefficients.get(variable, zeros) for variable in variables]
-    return np.concatenate(arrays, axis=-1)
+    all_B = [B.get(variable, zeros) for variable in variables]
+    all_beta = [beta.get(variable, np.zeros(shape[1])) for variable in variables]
+    return variables, np.concatenate(all_B, axis=1), np.concatenate(all_beta)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -358,10 +353,8 @@ class PartitionedTableau(AbstractTableau):
 
     def flatten(self) -> FlatTableau:
         num_velocities, num_forces = self.A.shape
-        variables = _variables(self.B0, self.beta)
         shape = (num_velocities, len(self.A1))
-        B0 = _side_by_side(self.B0, variables, shape)
-        beta = _side_by_side(self.beta, variables, shape[1:])
+        variables, B0, beta = _side_by_side(self.B0, self.beta, shape)
         # Forces come first: a plan tries to take the first stages for its unknowns, and
         # forces cost more to evaluate than velocities.
         forces = [Stage(("h",), float(c), "q", "p") for c in self.A_hat.sum(axis=1)]
@@ -431,11 +424,8 @@ class AdditiveTableau(AbstractTableau):
         return "constant" if self.constant else "additive"
 
     def flatten(self) -> FlatTableau:
-        drift_stages = len(self.alpha)
-        noise_stages = len(self.c1)
-        variables = _variables(self.B, self.beta)
-        B = _side_by_side(self.B, variables, (drift_stages, noise_stages))
-        beta = _side_by_side(self.beta, variables, (noise_stages,))
+        shape = (len(self.alpha), len(self.c1))
+        variables, B, beta = _side_by_side(self.B, self.beta, shape)
         drift = [Stage(("h",), float(c0), "y", "y") for c0 in self.A.sum(axis=1)]
         # Noise stages read no part of the state, so they are evaluated once in a step, not
         # in every iteration of the root finder.
@@ -445,7 +435,7 @@ class AdditiveTableau(AbstractTableau):
             for c1 in self.c1
         ]
         # Noise stages depend on no stage.
-        noise_rows = np.zeros((len(noise), drift_stages + len(noise)))
+        noise_rows = np.zeros((len(noise), len(drift) + len(noise)))
         return FlatTableau(
             stages=(*drift, *noise),
             matrix=np.block([[self.A, B], [noise_rows]]),

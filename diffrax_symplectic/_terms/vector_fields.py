@@ -92,7 +92,8 @@ def rate(drift: Terms, t: RealScalarLike, y: Y, args: Args) -> Y:
     t = jnp.asarray(t, jnp.result_type(t, jnp.float32))
     # The step has size one. Its place does not matter, since the drift is driven by time.
     start = jnp.zeros_like(t)
-    controls = [term.contr(start, start + 1) for term in drift]
+    end = jnp.ones_like(t)
+    controls = [term.contr(start, end) for term in drift]
     return apply(drift, controls, args, t, y)
 
 

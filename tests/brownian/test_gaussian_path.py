@@ -12,7 +12,7 @@ from scipy import special
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import random as words
 from diffrax_symplectic._brownian.random import normal_from_words
-from diffrax_symplectic._solver import common_path, path_of_array_cell
+from diffrax_symplectic._solver import common_path
 
 
 AREA = diffrax.SpaceTimeLevyArea
@@ -181,7 +181,7 @@ SOLVERS = [
 def test_a_cell_that_is_an_array_gives_the_same_motion(solver):
     cell, key = 0.125, jr.key(4)
     plain = common_path(solver, cell, (3,), key)
-    traced = path_of_array_cell(solver, np.asarray(cell), (3,), key)
+    traced = common_path(solver, np.asarray(cell), (3,), key)
     over = jnp.asarray(0.5), jnp.asarray(0.5 + 4 * cell)
     got = traced.evaluate(*over, use_levy=True)
     exact = plain.evaluate(*over, use_levy=True)
