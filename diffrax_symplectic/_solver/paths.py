@@ -48,7 +48,7 @@ def path_of_array_cell(
 ) -> diffrax.AbstractBrownianPath:
     """`common_path` with a `cell` that is an array: another one compiles nothing anew, but
     for solvers that need Lévy areas of pairs of noises."""
-    path = CommonBrownianPath(shape, key, cell)
+    path = CommonBrownianPath(shape, key, cell)  # pyright: ignore
     return _with_areas_for(solver, path, float(cell), key)
 
 
