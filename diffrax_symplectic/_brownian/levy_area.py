@@ -1,5 +1,5 @@
 import dataclasses
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
@@ -98,19 +98,26 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         self.cell = checked_cell(cell)
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
+        def piece_between(t0: Array, t1: Array) -> Piece:
+            # The areas read each normal number several times, and XLA would compute it anew
+            # for each.
+            increment = materialize(lambda: self.path.evaluate(t0, t1, use_levy=True))
+            num_words = self.num_own_words(True)
+            words = random_words(self.key, place_of(t0, t1), 1, num_words, AREA_WORDS)
+            return self._piece_from_words(increment, words[0], t1 - t0)
+
         cell = self.cell
         if cell is not None:
 
-            def start_of(i: Array) -> Array:
-                # Through rounding a cell may end just beyond the end of the path.
-                return jnp.clip(i * cell, self.path.t0, self.path.t1)
-
             def sample(i: Array) -> Piece:
-                return self._draw_piece(start_of(i), start_of(i + 1))
+                # Through rounding a cell may end just beyond the end of the path.
+                start = jnp.clip(i * cell, self.path.t0, self.path.t1)
+                end = jnp.clip((i + 1) * cell, self.path.t0, self.path.t1)
+                return piece_between(start, end)
 
             piece = compose(t0, t1, cell, sample, type(self).__name__)
         elif use_levy:
-            piece = self._draw_piece(t0, t1)
+            piece = piece_between(t0, t1)
         else:
             # The increment alone needs none of the words drawn here.
             return self.path.evaluate(t0, t1)
@@ -122,29 +129,19 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         m = num_noises(increment_struct(self.path))
         return sum(_group_sizes(m, self.num_terms))
 
-    def own_increment(self, increment, own_words, h, use_levy) -> Increment:
+    def own_increment(self, increment, own_words, h) -> Increment:
         """The increment with areas, sampled over the step as a whole, regardless of
         `cell`."""
-        if not use_levy:
+        if not isinstance(increment, diffrax.AbstractSpaceTimeLevyArea):
             return increment
-        return self._as_increment(
-            self._piece_from_words(increment, own_words, h), h, use_levy
-        )
+        piece = self._piece_from_words(increment, own_words, h)
+        return self._as_increment(piece, h, use_levy=True)
 
     def _as_increment(
         self, piece: Piece, h: RealScalarLike, use_levy: bool
     ) -> Increment:
         shape = increment_struct(self.path)
         return piece.as_increment(LevyAreaIncrement, shape, h, use_levy)
-
-    def _draw_piece(self, t0: Array, t1: Array) -> Piece:
-        """The path between these times, drawn as one piece."""
-        # The areas read each normal number several times, and XLA would compute it anew
-        # for each.
-        increment = materialize(lambda: self.path.evaluate(t0, t1, use_levy=True))
-        num_words = self.num_own_words(True)
-        words = random_words(self.key, place_of(t0, t1), 1, num_words, AREA_WORDS)
-        return self._piece_from_words(increment, words[0], t1 - t0)
 
     def _piece_from_words(
         self, increment: Increment, words: UInt32[Array, " normals"], h: RealScalarLike
@@ -163,33 +160,18 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         return dataclasses.replace(piece, A=outer - outer.T + bridge_area)
 
 
-class _Normals(NamedTuple):
-    """The independent standard normal numbers for the areas of a bridge.
-
-    - `cosines`, `sines`: for the Fourier coefficients, one noise after another.
-    - `remainder_sums`: for the sum of the remaining cosine coefficients of each noise.
-    - `mean_parts`: for the part of the remainder's area that comes from the means of these
-        coefficients, for each noise.
-    - `deviation_parts`: for the part that comes from their deviations, for each pair of
-        noises.
-    """
-
-    cosines: Float[Array, " m*terms"]
-    sines: Float[Array, " m*terms"]
-    remainder_sums: Float[Array, " m"]
-    mean_parts: Float[Array, " m"]
-    deviation_parts: Float[Array, " pairs"]
-
-
 def _group_sizes(m: int, num_terms: int) -> tuple[int, ...]:
-    """The numbers of normal variables in the fields of `_Normals`, for `m` noises."""
+    """The numbers of independent standard normal variables for the areas of a bridge of `m`
+    noises, by their use:
+
+    - for the Fourier coefficients of the cosines, one noise after another;
+    - for those of the sines;
+    - for the sum of the remaining cosine coefficients of each noise;
+    - for the part of the remainder's area that comes from the means of these coefficients,
+        for each noise;
+    - for the part that comes from their deviations, for each pair of noises.
+    """
     return m * num_terms, m * num_terms, m, m, m * (m - 1) // 2
-
-
-def _in_groups(normals: Float[Array, " normals"], m: int, num_terms: int) -> _Normals:
-    """The normal numbers by their use, for `m` noises."""
-    ends = np.cumsum(_group_sizes(m, num_terms))
-    return _Normals(*jnp.split(normals, ends[:-1]))
 
 
 def _bridge_area(
@@ -211,41 +193,37 @@ def _bridge_area(
     sum_beyond = 1 / 12 - np.sum(variances)
     sum_of_squares_beyond = max(1 / 360 - np.sum(variances**2), 0)
     deviations = jnp.asarray(np.sqrt(variances), H.dtype)
-    groups = _in_groups(normals, m, num_terms)
-    a = deviations * groups.cosines.reshape(m, num_terms)
-    b = deviations * groups.sines.reshape(m, num_terms)
-    sum_of_all = jnp.sum(a, axis=1) + np.sqrt(sum_beyond) * groups.remainder_sums
-    a_given_H = _with_integral(H, a, sum_of_all, variances)
+    ends_of_groups = np.cumsum(_group_sizes(m, num_terms))
+    groups = jnp.split(normals, ends_of_groups[:-1])
+    cosines, sines, remainder_sums, mean_parts, deviation_parts = groups
+    a = deviations * cosines.reshape(m, num_terms)
+    b = deviations * sines.reshape(m, num_terms)
+    # The integral is `H` if the sum of all cosine coefficients is -H. So the coefficients
+    # must lose the excess, sum plus H. Each loses a share in proportion to its variance,
+    # s_r over the sum of all variances, which is 1/12: this is how to condition independent
+    # Gaussian variables on their sum.
+    sum_of_all = jnp.sum(a, axis=1) + np.sqrt(sum_beyond) * remainder_sums
+    shares = jnp.asarray(12 * variances, H.dtype)
+    excess = sum_of_all + H
+    a_given_H = a - shares * excess[:, None]
     series = _weighted_product(a_given_H, b, np.pi * orders)
     # Given H, cosine coefficients of the remainder have the mean -12 s_r H, which gives the
     # first part of its area, and the variance s_r - 12 s_r^2, which gives the second. Since
     # (pi r)^2 s_r is 1/2, the variances of these parts are sums of 144 s_r^2 / 2 and of
     # s_r - 12 s_r^2.
-    mean_part = jnp.outer(H, np.sqrt(72 * sum_of_squares_beyond) * groups.mean_parts)
+    mean_part = jnp.outer(H, np.sqrt(72 * sum_of_squares_beyond) * mean_parts)
     deviation = np.sqrt(sum_beyond - 12 * sum_of_squares_beyond)
     without_deviation = series - mean_part
-    deviation_part = deviation * _strictly_upper(groups.deviation_parts, m)
+    # The numbers of the pairs above the diagonal, row by row. A gather, since scattering is
+    # slow; for one noise there is no entry to gather from.
+    indices = np.zeros((m, m), int)
+    indices[np.triu_indices(m, 1)] = np.arange(deviation_parts.size)
+    if m < 2:
+        deviation_parts = jnp.append(deviation_parts, 0)
+    deviation_part = deviation * jnp.triu(deviation_parts[indices], 1)
     # The products a_kr b_lr of the area. The other ones, b_kr a_lr, are their transpose.
     first_products = without_deviation + deviation_part
     return first_products - first_products.T
-
-
-def _with_integral(
-    H: Float[Array, " m"],
-    a: Float[Array, "m terms"],
-    sum_of_all: Float[Array, " m"],
-    variances: np.ndarray,
-) -> Float[Array, "m terms"]:
-    """The cosine coefficients `a` of these variances in `_bridge_area`, changed so that the
-    integral of the bridge is `H`. `sum_of_all` is the sum of `a` and of all coefficients
-    beyond."""
-    # The integral is `H` if the sum is -H. So the coefficients must lose the excess, sum
-    # plus H. Each loses a share in proportion to its variance, s_r over the sum of all
-    # variances, which is 1/12: this is how to condition independent Gaussian variables on
-    # their sum.
-    shares = jnp.asarray(12 * variances, H.dtype)
-    excess = sum_of_all + H
-    return a - shares * excess[:, None]
 
 
 def _weighted_product(
@@ -261,13 +239,3 @@ def _weighted_product(
     ]
     # Zeros to start from, since there may be no terms at all.
     return sum(products, jnp.zeros((len(a), len(a)), a.dtype))
-
-
-def _strictly_upper(x: Float[Array, " n"], m: int) -> Float[Array, "m m"]:
-    """The matrix with the entries `x` above its diagonal, row by row, and zeros
-    elsewhere."""
-    indices = np.zeros((m, m), int)
-    indices[np.triu_indices(m, 1)] = np.arange(x.size)
-    # A gather, since scattering is slow. For one noise there is no entry to gather from.
-    padded = jnp.append(x, 0) if x.size == 0 else x
-    return jnp.triu(padded[indices], 1)

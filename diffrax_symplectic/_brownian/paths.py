@@ -1,5 +1,8 @@
+import abc
+import functools as ft
+import math
 from collections.abc import Mapping
-from typing import ClassVar
+from typing import Any, cast, ClassVar, TYPE_CHECKING
 
 import diffrax
 import equinox as eqx
@@ -14,11 +17,28 @@ from .random import (
     AbstractLaw,
     check_key,
     FOUR_POINT,
+    Place,
     place_of,
+    random_words,
     THREE_POINT,
     TWO_POINT,
 )
-from .stepwise import AbstractPathWithLaws, checked_shape, GAUSSIAN_LAWS, Increment
+from .stepwise import (
+    AbstractStepwisePath,
+    checked_shape,
+    GAUSSIAN_LAWS,
+    Increment,
+    num_noises,
+    step_size,
+    variables_from_words,
+)
+
+
+if TYPE_CHECKING:
+    # In one module for all, Pyright would take the variables for arguments of `__init__`.
+    from typing import ClassVar as AbstractVar
+else:
+    from equinox import AbstractVar
 
 
 class WeakIncrement(diffrax.AbstractBrownianIncrement):
@@ -51,6 +71,64 @@ class WeakIncrement(diffrax.AbstractBrownianIncrement):
     third: BM | None = None
 
 
+class AbstractPathWithLaws(AbstractStepwisePath):
+    """A path whose steps consist of independent random variables: for each noise, one with
+    each of its `laws`. The law of the increment, `"W"`, comes first.
+
+    - `cell`: the length of the cells of which steps are composed; or `None` if each step is
+        sampled separately."""
+
+    shape: AbstractVar[PyTree[jax.ShapeDtypeStruct]]
+    key: AbstractVar[PRNGKeyArray]
+    cell: AbstractVar[float | Float[Array | np.ndarray, ""] | None]
+    t0: ClassVar[float] = -math.inf
+    t1: ClassVar[float] = math.inf
+
+    @property
+    @abc.abstractmethod
+    def laws(self) -> Mapping[str, AbstractLaw]: ...
+
+    def num_words(self, use_levy: bool = False) -> int:
+        num_sets = len(self.laws) if use_levy else 1
+        return num_sets * num_noises(self.shape)
+
+    def increment(self, words, t0, t1, use_levy: bool = False) -> Increment:
+        h = t1 - t0
+        set_size = num_noises(self.shape)
+        laws = self.laws if use_levy else {"W": self.laws["W"]}
+        variables = {}
+        for i, (name, law) in enumerate(laws.items()):
+            set_of_words = words[i * set_size : (i + 1) * set_size]
+            variables[name] = variables_from_words(law, set_of_words, h, self.shape)
+        if not use_levy:
+            return variables["W"]
+        # To a type checker `levy_area` is any class of increments.
+        return cast(Any, self.levy_area)(dt=step_size(h, self.shape), **variables)
+
+    def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
+        if self.cell is None:
+            return self._drawn_at(place_of(t0, t1), t0, t1, use_levy)
+        h = jnp.asarray(self.cell, t0.dtype)
+
+        def sample(i: Array) -> Piece:
+            # The number of a cell serves as its place: it is exact, and the times of the
+            # cell are rounded. Given the words, only the size of a step matters, not where
+            # it begins. Areas are always drawn, so that increments do not depend on
+            # `use_levy`.
+            place = (i.astype(jnp.int32), jnp.array(0))
+            return Piece.from_increment(self._drawn_at(place, 0 * h, h, True), h)
+
+        piece = compose(t0, t1, self.cell, sample, type(self).__name__)
+        return piece.as_increment(self.levy_area, self.shape, t1 - t0, use_levy)
+
+    def _drawn_at(self, place: Place, t0: Array, t1: Array, use_levy: bool):
+        """The increment for the random words of a place on the time axis."""
+        # One set for each law, so that the words of the first do not depend on `use_levy`.
+        num_sets = len(self.laws) if use_levy else 1
+        words = random_words(self.key, place, num_sets, num_noises(self.shape))
+        return self.increment(words.reshape(-1), t0, t1, use_levy)
+
+
 class WeakBrownianPath(AbstractPathWithLaws):
     r"""Discrete random variables in place of Brownian increments, for weak methods.
 
@@ -72,6 +150,7 @@ class WeakBrownianPath(AbstractPathWithLaws):
     two_point: bool = eqx.field(static=True)
     order: int = eqx.field(static=True)
     levy_area: ClassVar = WeakIncrement  # pyright: ignore
+    cell: ClassVar[None] = None  # pyright: ignore
 
     def __init__(
         self,
@@ -185,59 +264,16 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
     def laws(self) -> Mapping[str, AbstractLaw]:
         return GAUSSIAN_LAWS[self.levy_area]
 
-    def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
-        if self.cell is None:
-            words = self.words(place_of(t0, t1), use_levy)
-            return self.increment(words, t0, t1, use_levy)
-        return _drawn_over_cells(self, self.cell, t0, t1, use_levy)
-
 
 class CommonBrownianPath(AbstractPathWithLaws):
     """The Brownian motion of a `FixedStepBrownianPath` with space-time Lévy area and this
     `cell`, which may be traced here: a path with another one compiles nothing anew."""
 
-    shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
+    shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(
+        static=True,
+        converter=ft.partial(checked_shape, path_name="CommonBrownianPath"),
+    )
     key: PRNGKeyArray
     cell: Float[Array | np.ndarray, ""]
     levy_area: ClassVar = diffrax.SpaceTimeLevyArea  # pyright: ignore
-
-    def __init__(
-        self,
-        shape: tuple[int, ...] | PyTree[jax.ShapeDtypeStruct],
-        key: PRNGKeyArray,
-        cell: Float[Array | np.ndarray, ""],
-    ):
-        self.shape = checked_shape(shape, type(self).__name__)
-        self.key = key
-        self.cell = cell
-
-    @property
-    def laws(self) -> Mapping[str, AbstractLaw]:
-        return GAUSSIAN_LAWS[self.levy_area]
-
-    def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
-        return _drawn_over_cells(self, self.cell, t0, t1, use_levy)
-
-
-def _drawn_over_cells(
-    path: AbstractPathWithLaws,
-    cell: float | Float[Array | np.ndarray, ""],
-    t0: Array,
-    t1: Array,
-    use_levy: bool,
-) -> Increment:
-    """The increment of a path whose steps are composed of cells."""
-    h = jnp.asarray(cell, t0.dtype)
-
-    def sample(i: Array) -> Piece:
-        # The number of a cell serves as its place: it is exact, and the times of the cell
-        # are rounded.
-        place = (i.astype(jnp.int32), jnp.array(0))
-        # Areas are always drawn, so that increments do not depend on `use_levy`.
-        words = path.words(place, use_levy=True)
-        # Given the words, only the size of a step matters, not where it begins.
-        increment = path.increment(words, 0 * h, h, use_levy=True)
-        return Piece.from_increment(increment, h)
-
-    piece = compose(t0, t1, cell, sample, type(path).__name__)
-    return piece.as_increment(path.levy_area, path.shape, t1 - t0, use_levy)
+    laws: ClassVar = GAUSSIAN_LAWS[diffrax.SpaceTimeLevyArea]  # pyright: ignore

@@ -48,7 +48,13 @@ def random_words(
     if is_threefry(key) and 0 < num_words <= 2 * _MOST_PAIRS:
         words = _words_from_counters(key, place, num_words, first_pair)
         return words.reshape(num_sets, set_size)
-    return _words_from_keys_of_sets(key, place, num_sets, set_size, first_pair)
+    # Each set has a key of its own, so that more sets leave the first ones unchanged.
+    count, exponent = place
+    step_key = jr.fold_in(jr.fold_in(key, count), exponent)
+    set_keys = [jr.fold_in(step_key, first_pair + i) for i in range(num_sets)]
+    return jnp.stack(
+        [jr.bits(set_key, (set_size,), jnp.uint32) for set_key in set_keys]
+    )
 
 
 def _words_from_counters(
@@ -73,19 +79,6 @@ def _words_from_counters(
     # XLA would compute each of the two words in a separate kernel.
     words = jnp.stack(materialize(hash_counters), axis=1)
     return words.reshape(-1)[:num_words]
-
-
-def _words_from_keys_of_sets(
-    key: PRNGKeyArray, place: Place, num_sets: int, set_size: int, first_pair: int
-) -> UInt32[Array, "num_sets set_size"]:
-    """Words of any generator of JAX. Each set has a key of its own, so that more sets leave
-    the first ones unchanged."""
-    count, exponent = place
-    step_key = jr.fold_in(jr.fold_in(key, count), exponent)
-    set_keys = [jr.fold_in(step_key, first_pair + i) for i in range(num_sets)]
-    return jnp.stack(
-        [jr.bits(set_key, (set_size,), jnp.uint32) for set_key in set_keys]
-    )
 
 
 # Threefry-2x32 rotates by these numbers of bits, in turns, four times before it adds keys.
@@ -298,11 +291,11 @@ _ROOT3 = math.sqrt(3)
 _SIXTH_OF_WORDS = 2**32 // 6
 # The four-point law is the Gauss-Hermite rule with four nodes: two values and their
 # negatives, of which the larger one is less probable.
-_SMALL_VALUE = float(np.sqrt(3 - np.sqrt(6)))
-_LARGE_VALUE = float(np.sqrt(3 + np.sqrt(6)))
-_PROBABILITY_OF_SMALL = float((3 + np.sqrt(6)) / 12)
-_PROBABILITY_OF_LARGE = float((3 - np.sqrt(6)) / 12)
-_WORDS_OF_LARGE = round(2**32 * _PROBABILITY_OF_LARGE)
+_LARGE = math.sqrt(3 + math.sqrt(6))
+_SMALL = math.sqrt(3 - math.sqrt(6))
+_P_LARGE = (3 - math.sqrt(6)) / 12
+_P_SMALL = (3 + math.sqrt(6)) / 12
+_WORDS_OF_LARGE = round(2**32 * _P_LARGE)
 
 # This law matches moments 1 to 5 of the normal distribution. Odd moments vanish exactly,
 # since as many words give one sign as the other.
@@ -313,13 +306,8 @@ THREE_POINT = Discrete(
 )
 # This law matches moments 1 to 7. Words below 2^31 give negative values.
 FOUR_POINT = Discrete(
-    values=(-_LARGE_VALUE, -_SMALL_VALUE, _LARGE_VALUE, _SMALL_VALUE),
-    probabilities=(
-        _PROBABILITY_OF_LARGE,
-        _PROBABILITY_OF_SMALL,
-        _PROBABILITY_OF_LARGE,
-        _PROBABILITY_OF_SMALL,
-    ),
+    values=(-_LARGE, -_SMALL, _LARGE, _SMALL),
+    probabilities=(_P_LARGE, _P_SMALL, _P_LARGE, _P_SMALL),
     cuts=(_WORDS_OF_LARGE, 2**31, 2**31 + _WORDS_OF_LARGE),
 )
 

@@ -3,7 +3,7 @@
 import abc
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, cast, ClassVar, TYPE_CHECKING, TypeAlias
+from typing import cast, ClassVar, TYPE_CHECKING, TypeAlias
 
 import diffrax
 import equinox as eqx
@@ -12,12 +12,12 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray, PyTree, UInt32
+from jaxtyping import Array, PyTree, UInt32
 
 from .._compat import nondifferentiable
 from .._custom_types import RealScalarLike
 from .._programs import once_for_each_signature
-from .random import AbstractLaw, Gaussian, is_key, Place, place_of, random_words
+from .random import AbstractLaw, Gaussian, is_key
 
 
 if TYPE_CHECKING:
@@ -89,48 +89,6 @@ def _draw_increment(path: AbstractStepwisePath, t0: Array, t1: Array, use_levy: 
     return path.draw(t0, t1, use_levy)
 
 
-class AbstractPathWithLaws(AbstractStepwisePath):
-    """A path whose steps consist of independent random variables: for each noise, one with
-    each of its `laws`. The law of the increment, `"W"`, comes first."""
-
-    shape: AbstractVar[PyTree[jax.ShapeDtypeStruct]]
-    key: AbstractVar[PRNGKeyArray]
-    t0: ClassVar[float] = -math.inf
-    t1: ClassVar[float] = math.inf
-
-    @property
-    @abc.abstractmethod
-    def laws(self) -> Mapping[str, AbstractLaw]: ...
-
-    def num_words(self, use_levy: bool = False) -> int:
-        num_sets = len(self.laws) if use_levy else 1
-        return num_sets * num_noises(self.shape)
-
-    def words(self, place: Place, use_levy: bool) -> UInt32[Array, " num_words"]:
-        """The path's random words for a place on the time axis."""
-        # One set for each law, so that the words of the first do not depend on `use_levy`.
-        num_sets = len(self.laws) if use_levy else 1
-        words = random_words(self.key, place, num_sets, num_noises(self.shape))
-        return words.reshape(-1)
-
-    def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
-        words = self.words(place_of(t0, t1), use_levy)
-        return self.increment(words, t0, t1, use_levy)
-
-    def increment(self, words, t0, t1, use_levy: bool = False) -> Increment:
-        h = t1 - t0
-        set_size = num_noises(self.shape)
-        if not use_levy:
-            law = self.laws["W"]
-            return variables_from_words(law, words[:set_size], h, self.shape)
-        variables = {}
-        for i, (name, law) in enumerate(self.laws.items()):
-            set_of_words = words[i * set_size : (i + 1) * set_size]
-            variables[name] = variables_from_words(law, set_of_words, h, self.shape)
-        # To a type checker `levy_area` is any class of increments.
-        return cast(Any, self.levy_area)(dt=step_size(h, self.shape), **variables)
-
-
 class AbstractWrappedPath(AbstractStepwisePath):
     """A Brownian path that changes or extends the increments of another."""
 
@@ -154,9 +112,9 @@ class AbstractWrappedPath(AbstractStepwisePath):
         increment: Increment,
         own_words: UInt32[Array, " num_own_words"],
         h: RealScalarLike,
-        use_levy: bool,
     ) -> Increment:
-        """The increment of this path over a step of size `h`, from that of the other."""
+        """The increment of this path over a step of size `h`, from that of the other: with
+        `use_levy=False` an increment alone, and otherwise one with all variables."""
 
     def num_words(self, use_levy: bool = False) -> int:
         wrapped = checked_stepwise(self.path)
@@ -167,7 +125,7 @@ class AbstractWrappedPath(AbstractStepwisePath):
         wrapped = checked_stepwise(self.path)
         increment = wrapped.increment(words, t0, t1, use_levy)
         own_words = words[wrapped.num_words(use_levy) :]
-        return self.own_increment(increment, own_words, t1 - t0, use_levy)
+        return self.own_increment(increment, own_words, t1 - t0)
 
 
 class GivenPath(diffrax.AbstractBrownianPath):

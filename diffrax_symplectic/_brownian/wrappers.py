@@ -1,6 +1,6 @@
 import dataclasses
 import math
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
@@ -132,8 +132,11 @@ class TruncatedBrownianPath(AbstractWrappedPath):
                 "The increments of a `WeakBrownianPath` are already bounded, and "
                 "truncation would change their moments. Pass it without truncation."
             )
-        if unit is not None and not _may_be_positive(unit):
-            raise ValueError(f"`unit` must be a positive number; got {unit!r}.")
+        if unit is not None:
+            is_number = eqx.is_array_like(unit) and jnp.shape(unit) == ()
+            # A traced number is positive as far as it is known.
+            if not is_number or not (is_traced(unit) or 0 < float(unit) < math.inf):
+                raise ValueError(f"`unit` must be a positive number; got {unit!r}.")
         self.path = path
         self.k = whole_number("k", k)
         self.unit = unit
@@ -145,12 +148,12 @@ class TruncatedBrownianPath(AbstractWrappedPath):
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         increment = self.path.evaluate(t0, t1, use_levy=use_levy)
         no_words = jnp.zeros(0, jnp.uint32)
-        return self.own_increment(increment, no_words, t1 - t0, use_levy)
+        return self.own_increment(increment, no_words, t1 - t0)
 
     def num_own_words(self, use_levy: bool) -> int:
         return 0
 
-    def own_increment(self, increment, own_words, h, use_levy) -> Increment:
+    def own_increment(self, increment, own_words, h) -> Increment:
         length = jnp.abs(h)
         length_in_units = length
         if self.unit is not None:
@@ -168,13 +171,6 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         return jtu.tree_map(clip, increment)
 
 
-def _may_be_positive(unit: Any) -> bool:
-    """Whether this is a positive finite number, as far as it is known."""
-    if not eqx.is_array_like(unit) or jnp.shape(unit) != ():
-        return False
-    return is_traced(unit) or 0 < float(unit) < math.inf
-
-
 def lost_variance(path: diffrax.AbstractBrownianPath, h: float) -> float:
     """The share of the variance of an increment over a step of size `h` that is lost by
     truncation. If wrappers truncate several times, the largest share of one of them."""
@@ -186,17 +182,13 @@ def lost_variance(path: diffrax.AbstractBrownianPath, h: float) -> float:
             # for steps of a `unit` and longer, of which nothing is left.
             unit = 1.0 if remaining.unit is None else float(remaining.unit)
             bound = math.sqrt(2 * remaining.k * max(-math.log(h / unit), 0))
-            share = max(share, _variance_lost_beyond(bound))
+            # `1 - E[min(|x|, bound)^2]` for a standard normal `x`, by partial integration
+            # of `x^2 - bound^2` over both tails.
+            density = math.exp(-(bound**2) / 2) / math.sqrt(2 * math.pi)
+            tail = math.erfc(bound / math.sqrt(2)) / 2
+            share = max(share, 2 * (bound * density + (1 - bound**2) * tail))
         remaining = remaining.path
     return share
-
-
-def _variance_lost_beyond(bound: float) -> float:
-    """`1 - E[min(|x|, bound)^2]` for a standard normal `x`, by partial integration of
-    `x^2 - bound^2` over both tails."""
-    density = math.exp(-(bound**2) / 2) / math.sqrt(2 * math.pi)
-    tail = math.erfc(bound / math.sqrt(2)) / 2
-    return 2 * (bound * density + (1 - bound**2) * tail)
 
 
 class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
@@ -223,15 +215,14 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
 
     @property
     def C(self) -> BM:
-        return jtu.tree_map(_plateau_offset, self.dt, self.W, self.H, self.sign)
+        def of_array(h: Array, W: Array, H: Array, sign: Array) -> Array:
+            # In a solve backward in time Diffrax negates everything, including the step
+            # size.
+            h = jnp.abs(h).astype(W.dtype)
+            size = jnp.sqrt(h / 15 + W**2 / 12 + H**2 / 5)
+            return jnp.copysign(size, sign)
 
-
-def _plateau_offset(h: Array, W: Array, H: Array, sign: Array) -> Array:
-    """The variables `C` of one array of noises."""
-    # In a solve backward in time Diffrax negates everything, including the step size.
-    h = jnp.abs(h).astype(W.dtype)
-    size = jnp.sqrt(h / 15 + W**2 / 12 + H**2 / 5)
-    return jnp.copysign(size, sign)
+        return jtu.tree_map(of_array, self.dt, self.W, self.H, self.sign)
 
 
 class PlateauBrownianPath(AbstractWrappedPath):
@@ -271,14 +262,13 @@ class PlateauBrownianPath(AbstractWrappedPath):
             return increment
         num_words = self.num_own_words(use_levy)
         words = random_words(self.key, place_of(t0, t1), 1, num_words, PLATEAU_WORDS)
-        return self.own_increment(increment, words[0], t1 - t0, use_levy)
+        return self.own_increment(increment, words[0], t1 - t0)
 
     def num_own_words(self, use_levy: bool) -> int:
         return num_noises(increment_struct(self.path)) if use_levy else 0
 
-    def own_increment(self, increment, own_words, h, use_levy) -> Increment:
-        if not use_levy:
+    def own_increment(self, increment, own_words, h) -> Increment:
+        if not isinstance(increment, diffrax.AbstractSpaceTimeLevyArea):
             return increment
-        assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
         sign = variables_from_words(TWO_POINT, own_words, h, increment.W)
         return PlateauIncrement(increment.dt, increment.W, increment.H, sign)

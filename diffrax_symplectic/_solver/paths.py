@@ -43,7 +43,7 @@ def common_path(
     an array, another one compiles nothing anew, but for solvers that need Lévy areas of
     pairs of noises."""
     if isinstance(cell, np.ndarray):
-        path = CommonBrownianPath(shape, key, cell)
+        path = CommonBrownianPath(shape, key, cell)  # pyright: ignore
     else:
         path = FixedStepBrownianPath(
             shape, key, levy_area=diffrax.SpaceTimeLevyArea, cell=cell
