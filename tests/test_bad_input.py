@@ -288,42 +288,6 @@ def test_a_forgotten_args_is_asked_about():
     asked("phi", AttributeError, lambda: mean(lambda t, y, args: args.k, terms))
 
 
-def test_an_unsolved_step_is_reported():
-    H0 = lambda t, p, q, args: jnp.sum(p**2 * q**2) / 2
-    terms = ds.hamiltonian_terms(H0, H0, ds.WeakBrownianPath((), jr.key(0)))
-    solver = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(newton_steps=1))
-
-    def solve(size, throw):
-        y0 = (size * jnp.ones(2),) * 2
-        return diffrax.diffeqsolve(terms, solver, 0.0, 80.0, 40.0, y0, throw=throw)
-
-    # In a batch the others are solved.
-    sizes = jnp.array([1.0, 1e-3])
-    result = jax.jit(jax.vmap(lambda size: solve(size, False).result))(sizes)
-    one = diffrax.RESULTS.successful
-    good = jax.vmap(lambda r: r == one)(result)
-    np.testing.assert_array_equal(good, [False, True])
-    # Diffrax raises what the result says.
-    with pytest.raises(RuntimeError, match="nonlinear solver"):
-        solve(jnp.array(1.0), True)
-
-
-def test_a_step_that_is_not_finite_is_reported():
-    path = ds.WeakBrownianPath((2,), jr.key(0))
-    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + jnp.linalg.norm(q)
-    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: q, path)
-    solve = lambda q, throw: diffrax.diffeqsolve(
-        terms, ds.StormerVerlet(), 0.0, 1.0, 0.25, (jnp.zeros(2), q), throw=throw
-    )
-    # The gradient of a norm at zero. In a batch the others are solved.
-    starts = jnp.array([[0.0, 0.0], [3.0, 4.0]])
-    result = jax.jit(jax.vmap(lambda q: solve(q, False).result))(starts)
-    good = jax.vmap(lambda r: r == diffrax.RESULTS.successful)(result)
-    np.testing.assert_array_equal(good, [False, True])
-    with pytest.raises(RuntimeError, match="(?i)nonfinite"):
-        solve(starts[0], True)
-
-
 def _position(t, y, args):
     return y[1]
 
@@ -333,7 +297,6 @@ def _force(t, p, q, args):
 
 
 TERMS = ds.hamiltonian_terms(lambda t, p, q, args: p**2 / 2 - jnp.cos(q), _force, ())
-DRAWN = ds.monte_carlo(jr.normal, key=jr.key(0), num_paths=16)
 
 
 GIVEN = dict(t0=0, t1=1, y0=(0.0, 1.0), key=jr.key(0))
@@ -374,12 +337,12 @@ HUGE = 10**12
 # From a message to calls that are answered by it. None of them compiles a program.
 REFUSED = {
     "`confidence` must be a number between 0 and 1, such as 0.95": [
-        lambda: DRAWN.interval(95),
-        lambda: DRAWN.interval(0),
-        lambda: DRAWN.interval(float("nan")),
-        lambda: DRAWN.interval("0.95"),  # pyright: ignore
-        lambda: DRAWN.interval(None),  # pyright: ignore
-        lambda: DRAWN.interval(np.array([0.5, 0.9])),  # pyright: ignore
+        lambda: _drawn().interval(95),
+        lambda: _drawn().interval(0),
+        lambda: _drawn().interval(float("nan")),
+        lambda: _drawn().interval("0.95"),  # pyright: ignore
+        lambda: _drawn().interval(None),  # pyright: ignore
+        lambda: _drawn().interval(np.array([0.5, 0.9])),  # pyright: ignore
     ],
     "`tol` must be a positive number": [
         lambda: _mean(tol=True),

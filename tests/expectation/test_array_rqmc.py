@@ -371,20 +371,9 @@ def test_a_shape_stands_for_the_path_that_the_solver_needs(solver):
     own = isinstance(solver, ds.AbstractSymplecticSolver)
     path = ds.FixedStepBrownianPath((), jr.key(0), diffrax.SpaceTimeLevyArea)
     path = solver.path((), jr.key(0), want="weak") if own else path
-    sampling = ds.IndependentPaths(64)
+    options = dict(key=jr.key(1), levels=1, sampling=ds.IndependentPaths(64))
     got, expected = (
-        ds.expectation(
-            phi,
-            make(x),
-            solver,
-            0.0,
-            1.0,
-            0.25,
-            y0,
-            key=jr.key(1),
-            levels=1,
-            sampling=sampling,
-        )  # fmt: skip
+        ds.expectation(phi, make(x), solver, 0.0, 1.0, 0.25, y0, **options)
         for x in ((), path)
     )
     assert got.mean == expected.mean

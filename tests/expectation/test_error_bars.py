@@ -94,13 +94,6 @@ def test_an_indicator_that_no_path_meets_is_told():
         ds.monte_carlo(lambda key: jr.normal(key) > 9, key=KEY, num_paths=100)
 
 
-def test_the_standard_error_is_no_less_than_rounding():
-    got = ds.monte_carlo(
-        lambda key: 1e6 + 1e-12 * jr.normal(key), key=KEY, num_paths=1000
-    )
-    assert got.std_error >= 1e6 * np.finfo(float).eps
-
-
 def test_few_samples_that_make_up_for_the_spread_widen_it_and_are_told():
     heavy = lambda key: jnp.exp(5 * jr.normal(key))
     with pytest.warns(UserWarning, match="One path in 2,000 accounts for"):

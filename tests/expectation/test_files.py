@@ -17,10 +17,12 @@ def _phi(key):
     return {"pair": jr.normal(key, (2,)), "rest": (jr.normal(key), None)}
 
 
-ESTIMATE = ds.monte_carlo(_phi, key=jr.key(0), num_paths=40, batch_size=16)
+@pytest.fixture(scope="module")
+def estimate():
+    return ds.monte_carlo(_phi, key=jr.key(0), num_paths=40, batch_size=16)
 
 
-def _saved(estimate=ESTIMATE) -> bytes:
+def _saved(estimate) -> bytes:
     file = io.BytesIO()
     estimate.save(file)
     return file.getvalue()
@@ -31,20 +33,20 @@ def _loaded(content: bytes) -> ds.Expectation:
 
 
 def test_an_estimate_comes_back_from_a_path_without_suffix_and_from_an_open_file(
-    tmp_path,
+    tmp_path, estimate
 ):
-    ESTIMATE.save(tmp_path / "estimate")
-    ESTIMATE.save(str(tmp_path / "estimate"))
+    estimate.save(tmp_path / "estimate")
+    estimate.save(str(tmp_path / "estimate"))
     assert [*tmp_path.iterdir()] == [tmp_path / "estimate"]
-    for got in (ds.Expectation.load(tmp_path / "estimate"), _loaded(_saved())):
-        assert str(got) == str(ESTIMATE) and got.samples == ESTIMATE.samples
+    for got in (ds.Expectation.load(tmp_path / "estimate"), _loaded(_saved(estimate))):
+        assert str(got) == str(estimate) and got.samples == estimate.samples
     with pytest.raises(FileNotFoundError, match="nothing"):
         ds.Expectation.load(tmp_path / "nothing")
 
 
-def test_a_file_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch, estimate):
     file = tmp_path / "estimate.npz"
-    ESTIMATE.save(file)
+    estimate.save(file)
     before = file.read_bytes()
     replace, sync = os.replace, os.fsync
     done = []
@@ -60,16 +62,16 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
     for stop in (OSError("disk full"), KeyboardInterrupt()):
         monkeypatch.setattr(np, "savez", half)
         with pytest.raises(type(stop)):
-            ESTIMATE.save(file)
+            estimate.save(file)
         assert file.read_bytes() == before and [*tmp_path.iterdir()] == [file]
     monkeypatch.setattr(np, "savez", whole)
     done.clear()
-    ESTIMATE.save(file)
+    estimate.save(file)
     assert done == ["sync", "move"] and [*tmp_path.iterdir()] == [file]
 
 
-def test_a_damaged_file_is_read_as_it_was_or_refused():
-    whole = _saved()
+def test_a_damaged_file_is_read_as_it_was_or_refused(estimate):
+    whole = _saved(estimate)
     rng = random.Random(0)
     damaged = [whole[:end] for end in range(0, len(whole), 37)]
     for place in range(0, len(whole), 11):
@@ -84,7 +86,7 @@ def test_a_damaged_file_is_read_as_it_was_or_refused():
             num_refused += 1
             assert "is damaged, or was not written by" in str(error)
         else:
-            assert str(got) == str(ESTIMATE) and got.samples == ESTIMATE.samples
+            assert str(got) == str(estimate) and got.samples == estimate.samples
     assert num_refused > len(damaged) / 2
 
 
@@ -106,9 +108,9 @@ def test_other_files_are_refused_without_advice_to_unpickle(tmp_path):
         assert "pickle" not in str(info.value) and info.value.__suppress_context__
 
 
-def _with_header(**changes) -> bytes:
+def _with_header(estimate, **changes) -> bytes:
     """A whole file, with other entries in its header, or without those that are `...`."""
-    arrays = dict(np.load(io.BytesIO(_saved())))
+    arrays = dict(np.load(io.BytesIO(_saved(estimate))))
     header = json.loads(str(arrays.pop("header"))) | changes
     header = {name: x for name, x in header.items() if x is not ...}
     file = io.BytesIO()
@@ -149,13 +151,13 @@ RANGES = [[0, 32, 32, 0, [0]], [32, 40, 8, 0, [0]]]
     ],
     ids=str,
 )  # fmt: skip
-def test_a_header_that_no_estimate_has_is_refused(changes):
-    assert str(_loaded(_with_header(ranges=RANGES))) == str(ESTIMATE)
+def test_a_header_that_no_estimate_has_is_refused(changes, estimate):
+    assert str(_loaded(_with_header(estimate, ranges=RANGES))) == str(estimate)
     with pytest.raises(ValueError, match="is damaged, or was not written by"):
-        _loaded(_with_header(**changes))
+        _loaded(_with_header(estimate, **changes))
 
 
-def test_what_is_no_file_is_refused_before_it_is_used():
-    for use in (ESTIMATE.save, ds.Expectation.load):
+def test_what_is_no_file_is_refused_before_it_is_used(estimate):
+    for use in (estimate.save, ds.Expectation.load):
         with pytest.raises(ValueError, match="`file` must be a path, or a file that"):
             use(3)  # pyright: ignore

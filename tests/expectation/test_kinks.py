@@ -12,6 +12,8 @@ from scipy.special import ndtr
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation.kinks import may_have_kinks
 
+from ..picard import by_picard
+
 
 Y0 = jnp.array(0.0), jnp.array(0.0)
 STEPS = 4
@@ -95,7 +97,7 @@ def test_a_shape_becomes_a_gaussian_path_where_phi_jumps():
 
 def test_a_weak_method_has_no_gaussian_path():
     options = dict(key=jr.key(1), sampling=ds.IndependentPaths(10))
-    solver = ds.SRKw5()
+    solver = by_picard(ds.SRKw5())
     with pytest.warns(UserWarning, match="`SRKw5` has discrete increments alone"):
         estimate = ds.expectation(beyond, walk(()), solver, 0, 1, 0.5, Y0, **options)
     assert "Gaussian" not in estimate.reason
@@ -116,14 +118,14 @@ def test_a_trial_with_gaussian_increments_is_made_at_long_steps_too():
 
 
 def test_a_law_that_changes_the_mean_is_told():
-    few = ds.IndependentPaths(20_000)
+    few = dict(sampling=ds.IndependentPaths(20_000), levels=1)
     weak = walk(ds.WeakBrownianPath((), jr.key(0)))
     with pytest.warns(UserWarning, match="changes by up to .* with Gaussian"):
-        estimate = mean(beyond, weak, sampling=few)
+        estimate = mean(beyond, weak, **few)
     # Four steps of three values each.
     assert abs(estimate.mean - ndtr(-0.5)) > 5 * estimate.std_error
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        mean(lambda t, y, args: y[0] ** 2, weak, sampling=few)
+        mean(lambda t, y, args: y[0] ** 2, weak, **few)
         gaussian = walk(ds.FixedStepBrownianPath((), jr.key(0)))
-        assert np.isfinite(mean(beyond, gaussian, sampling=few).mean)
+        assert np.isfinite(mean(beyond, gaussian, **few).mean)

@@ -9,6 +9,8 @@ import pytest
 
 import diffrax_symplectic as ds
 
+from ..picard import by_picard
+
 
 ZERO = jnp.array(0.0)
 ONE = jnp.array(1.0)
@@ -39,7 +41,7 @@ def part(
 OTHERS = {
     "args": dict(k=9 * ONE),
     "terms": dict(energy=lambda t, p, q, args: p**2 / 2 + args * q**2),
-    "solver": dict(solver=ds.ImplicitMidpoint()),
+    "solver": dict(solver=by_picard(ds.ImplicitMidpoint())),
     "dt0": dict(dt0=0.25),
     "t1": dict(t1=2.0),
     "t0": dict(t0=0.5, t1=1.5),

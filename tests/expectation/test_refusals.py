@@ -14,6 +14,7 @@ from diffrax_symplectic._brownian import is_random
 from diffrax_symplectic._terms import path_keys, with_keys
 
 from ..drjit_here import needs_drjit
+from ..picard import by_picard
 from ..solver.test_times_and_paths import RECORD
 
 
@@ -55,8 +56,9 @@ class Kicks(diffrax.AbstractBrownianPath):
 
 
 def test_random_noise_of_a_path_of_ones_own_has_one():
-    estimate = _mean(Kicks(jr.key(0)), ds.IndependentPaths(4000))
-    theirs = _mean(ds.FixedStepBrownianPath((), jr.key(0)), ds.IndependentPaths(4000))
+    several = ds.IndependentPaths(4000)
+    estimate = _mean(Kicks(jr.key(0)), several, levels=1)
+    theirs = _mean(ds.FixedStepBrownianPath((), jr.key(0)), several, levels=1)
     error = np.hypot(estimate.std_error, theirs.std_error)
     assert 0 < estimate.std_error and abs(estimate.mean - theirs.mean) <= 4 * error
 
@@ -86,8 +88,8 @@ def test_a_control_term_may_have_the_shape_of_its_path():
     drift = diffrax.ODETerm(lambda t, y, args: -y)
     terms_with = lambda path: diffrax.MultiTerm(drift, diffrax.ControlTerm(field, path))
     mean = lambda path: ds.expectation(
-        lambda t, y, args: y[0] ** 2, terms_with(path), ds.SRKw5(), 0, 1, 0.5,
-        jnp.zeros(1), key=jr.key(0), sampling=ds.IndependentPaths(16),
+        lambda t, y, args: y[0] ** 2, terms_with(path), by_picard(ds.SRKw5()), 0, 1, 0.5,
+        jnp.zeros(1), key=jr.key(0), sampling=ds.IndependentPaths(16), levels=1,
     )  # fmt: skip
     assert mean((3,)).std_error > 0
     suggestions = ds.suggest_solver(terms_with((3,)), 0.0, jnp.zeros(1), want="weak")
@@ -151,7 +153,7 @@ def test_steps_that_single_precision_does_not_resolve_are_refused_at_once():
     y0 = jnp.zeros((), jnp.float32), jnp.ones((), jnp.float32)
     with pytest.raises(ValueError, match="100 times the rounding.*float32"):
         _mean(path, y0=y0, t0=1e6, t1=1e6 + 1)
-    _mean(path, ds.IndependentPaths(10), y0=y0, t0=100.0, t1=101.0)
+    _mean(path, ds.IndependentPaths(10), y0=y0, t0=100.0, t1=101.0, levels=1)
 
 
 def test_a_function_of_spins_is_told_that_it_gets_a_pair():

@@ -106,7 +106,7 @@ def test_of_rounding():
 def test_of_coordinates_to_sort_by():
     sampling = ds.ArrayRQMC(256, 2)
     here(
-        mean(first, GAUSSIAN, jnp.ones(8), sampling),
+        mean(first, GAUSSIAN, jnp.ones(8), sampling, levels=1),
         "sorted by 8 coordinates, which leaves 2.0",
     )
 
@@ -115,7 +115,10 @@ def test_of_coordinates_to_sort_by():
 def test_of_a_fit_that_takes_long(monkeypatch):
     monkeypatch.setattr(value_functions, "_MOST_WITHOUT_WARNING", 1)
     sampling = ds.ValueFunctions(2, 64)
-    here(mean(first, WEAK, jnp.ones(2), sampling), "The fit of `ValueFunctions`")
+    here(
+        mean(first, WEAK, jnp.ones(2), sampling),
+        "The fit of `ValueFunctions` takes as long",
+    )
 
 
 @pytest.mark.slow
@@ -164,7 +167,8 @@ def test_of_stragglers():
     here(follow(terms, solver, 4, 0.8, engine="drjit"), "were simulated again")
     square = lambda t, y, args: y[1] ** 2
     given = square, terms, solver, 0, 4, 0.8, ONE
-    options = dict(key=KEY, sampling=ds.IndependentPaths(60), engine="drjit")
+    few = ds.IndependentPaths(60)
+    options = dict(key=KEY, sampling=few, engine="drjit", levels=1)
     here(lambda: ds.expectation(*given, **options), "were simulated again")
 
 
@@ -176,4 +180,5 @@ def test_of_truncated_increments():
     here(follow(terms, solver, 0.5, 0.5), "lose 16.2% of their variance")
     kinked = lambda t, y, args: jnp.abs(y[1])
     given = kinked, terms, solver, 0, 1, 0.5, ONE
-    here(lambda: ds.expectation(*given, key=KEY, sampling=FEW), "lose 16.2% of their")
+    options = dict(key=KEY, sampling=FEW, levels=1)
+    here(lambda: ds.expectation(*given, **options), "lose 16.2% of their")

@@ -42,7 +42,7 @@ def _path(shape):
     return ds.FixedStepBrownianPath(shape, jr.key(0))
 
 
-def _moment_map(terms, solver, h, y0):
+def moment_map(terms, solver, h, y0):
     """The map of second moments of (1, p, q) by one step, exactly."""
     of = lambda h: ds.second_moment_map(terms, solver, 0.0, h, y0)
     return np.asarray(jax.jit(of)(h))
@@ -50,7 +50,7 @@ def _moment_map(terms, solver, h, y0):
 
 def stationary_moments(terms, solver, h, y0):
     """Second moments of (p, q), exactly."""
-    K = _moment_map(terms, solver, h, y0)
+    K = moment_map(terms, solver, h, y0)
     n = round(len(K) ** 0.5)
     A = np.eye(n * n - 1) - K[1:, 1:]
     moments = np.append(1.0, np.linalg.solve(A, K[1:, 0]))
@@ -107,7 +107,7 @@ def test_free_particles_diffuse_as_einstein_says_for_any_step(friction, solver):
     fastest = rates[-1]
     for rate_h in (0.2, 1.0, 4.0):
         h = rate_h / fastest
-        K = _moment_map(terms, solver, h, (jnp.zeros(3),) * 2)
+        K = moment_map(terms, solver, h, (jnp.zeros(3),) * 2)
         # After a time in which each mode forgets its start.
         before = np.linalg.matrix_power(K, round(40 / min(slowest * h, 1)))
         grown = ((K @ before)[:, 0] - before[:, 0]).reshape(7, 7)[4:, 4:]

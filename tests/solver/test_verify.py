@@ -10,6 +10,7 @@ import pytest
 import diffrax_symplectic as ds
 
 from ..families import slow_except
+from ..picard import by_picard
 from ..problems import (
     Given,
     H0,
@@ -25,7 +26,8 @@ def test_weak_order_defect_sees_a_method_of_lower_order():
     terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
     y0, args = jax.vmap(lambda key: random_problem(key, 1, 1))(jr.split(jr.key(0), 4))
     hs = np.array([0.02, 0.005])
-    slopes = local_weak_orders(terms, ds.ImplicitMidpoint(), y0, args, hs, order=2)
+    solver = by_picard(ds.ImplicitMidpoint())
+    slopes = local_weak_orders(terms, solver, y0, args, hs, order=2)
     assert np.median(slopes) < 2.5
 
 

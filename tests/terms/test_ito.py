@@ -14,6 +14,8 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._terms import split_terms
 from diffrax_symplectic._terms.symplectic_gradients import is_hamiltonian
 
+from ..picard import by_picard
+
 
 Y = jnp.array(1.3)
 ONE = ds.WeakBrownianPath((), jr.key(0))
@@ -33,9 +35,10 @@ def test_the_mean_of_geometric_brownian_motion_is_that_of_its_drift():
     noise = _geometric(0.3)
     np.testing.assert_allclose(_correction(noise), -(0.3**2) * Y / 2)
     terms = diffrax.MultiTerm(drift, ds.ito_drift(noise), noise)
-    mean = ds.step_expectation(
-        terms, ds.ImplicitMidpoint(), 0.0, 1e-3, Y, fn=lambda t, y, args: y
-    )
+    solver = by_picard(ds.ImplicitMidpoint())
+    given = terms, solver, 0.0, 1e-3
+    identity = lambda t, y, args: y
+    mean = jax.jit(lambda y0: ds.step_expectation(*given, y0, fn=identity))(Y)
     np.testing.assert_allclose(mean, Y * np.exp(0.5e-3), rtol=1e-7)
 
 
