@@ -4,7 +4,8 @@ Some of it is private, some is public but undocumented, and some is how a class 
 store what it was given. It is used nowhere else. If a test of it in
 `tests/test_private_parts.py`, or of what uses it, fails after an upgrade, change the
 function here.
-(What operations of MLIR tell is read in `_stablehlo/mlir.py`, in the same way.)
+(What operations of MLIR tell is read in `_stablehlo/mlir.py` and `operation.py`, in the
+same way.)
 """
 
 import dataclasses
