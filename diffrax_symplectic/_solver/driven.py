@@ -112,7 +112,8 @@ def drawn_variables(
     def all_have(name: str) -> bool:
         return all(getattr(x, name, None) is not None for x in increments)
 
-    if missing := [name for name in names if not all_have(name)]:
+    missing = [name for name in names if not all_have(name)]
+    if missing:
         raise ValueError(f"`{solver_name}` needs {_how_to_get(missing, noise)}.")
     variables = {}
     for name in [*names, *filter(all_have, optional)]:
