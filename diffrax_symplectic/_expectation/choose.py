@@ -132,7 +132,7 @@ class _Best(NamedTuple):
 
 
 def _best_sampling(problem: Problem, request: Request) -> _Best:
-    """The sampling that suits a problem best, by its sizes and by trials of a fit."""
+    """The sampling that suits a problem best, by its sizes and by a trial of a fit."""
     tol = request.tol
     sampling, reason = sampling_for(problem, tol, request.engine)
     plan = _plan_for(problem, sampling, request)
