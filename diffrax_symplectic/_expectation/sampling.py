@@ -101,7 +101,7 @@ class SamplingPlan(NamedTuple):
         not.
     - `reason`: why this sampling was chosen, for the result.
     - `remainder`: the largest fraction of a standard error that a control variate leaves of
-        it, by trials.
+        it, by a trial.
     - `is_quick`: whether the samples take less time than compiling their program, which is
         then compiled for speed of compilation.
     - `simulate_paths`: for paths computed outside JAX, maps the number of the first sample

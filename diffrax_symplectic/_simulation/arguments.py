@@ -142,13 +142,9 @@ def drawn_args(args_of: Callable, key: PRNGKeyArray) -> Args:
         raise
 
     check_args(args)
-
     # Each path has its own arrays of JAX. All paths share leaves that are no arrays.
-    def with_jax_array(leaf: Any) -> Any:
-        is_numpy = isinstance(leaf, np.ndarray | np.generic)
-        return jnp.asarray(leaf) if is_numpy else leaf
-
-    return jtu.tree_map(with_jax_array, args)
+    arrays, others = eqx.partition(args, eqx.is_array)
+    return eqx.combine(jtu.tree_map(jnp.asarray, arrays), others)
 
 
 def check_noise(terms: PyTree) -> None:

@@ -1,6 +1,6 @@
 """Paths with control variates from fitted value functions.
 
-- `value_functions`: the sampling. Its trials decide which fits are used.
+- `value_functions`: the sampling. A trial decides where the fit is used.
 - `noise`: the random variables of a step, and expectations over them.
 - `bases`, `grid`: the functions that are fitted; `polynomials`: what both are made of;
   `basis_choice`: which of them.
