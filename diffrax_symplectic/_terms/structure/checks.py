@@ -18,8 +18,12 @@ from ..._custom_types import Args, RealScalarLike, Terms, Y
 from ..._tableau import Structure
 from ..constrained_drift import without_constraint
 from ..dependence import Dependence
-from ..drift_and_noise import control_struct, split_terms
-from ..langevin import friction_apart, split_friction
+from ..drift_and_noise import (
+    control_struct,
+    friction_apart,
+    split_friction,
+    split_terms,
+)
 from ..lifted import has_lifted
 from ..paths import brownian_paths
 from ..symplectic_gradients import (
