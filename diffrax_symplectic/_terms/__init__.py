@@ -17,8 +17,8 @@ What solvers and expectations ask of terms, from the bottom up:
 - `callers`: programs in place of the user's functions.
 - `evaluation`: calls of the user's functions, with advice on their errors.
 - `constrained_drift`: the drift of a system with a constraint.
-- `drift_and_noise`: which terms are drifts, and which are noises.
 - `symplectic_gradients`: the vector fields of Hamiltonians.
+- `drift_and_noise`: which terms are drifts, which are noises, and drifts taken apart.
 - `vector_fields`: vector fields times controls.
 - `step_variables`: the random variables of a step and their laws.
 - `structure`: whether a system has the structure that a solver needs, and what is wrong
@@ -30,13 +30,13 @@ from .constrained_drift import check_unconstrained, constraint_of
 from .constrained_drift import with_constraint, without_constraint
 from .constraint import check_start, constrained_state, NormalSpace, Surface
 from .dependence import acts_elementwise, Dependence
-from .drift_and_noise import control_struct, field_of, number_of_noises, split_terms
+from .drift_and_noise import control_struct, field_of, friction_apart, number_of_noises
+from .drift_and_noise import slow_apart, split_friction, split_terms
 from .evaluation import call_user_function, NEED_VALUES
 from .hamiltonian import hamiltonian_terms, noise_terms
 from .ito import ito_drift
-from .langevin import AbstractFriction, bath_terms, BathNoise, friction_apart
-from .langevin import FrictionAlong, langevin_terms, momentum_first
-from .langevin import semidefinite_root, split_friction
+from .langevin import bath_terms, BathNoise, FrictionAlong, langevin_terms
+from .langevin import momentum_first, semidefinite_root
 from .lifted import has_lifted
 from .paths import brownian_paths, has_unknown_law, motion_numbers, path_keys
 from .paths import random_paths, replace_paths, shapes_as_paths, which_are_shapes
@@ -48,6 +48,6 @@ from .structure import check_drifts_differ, check_stratonovich, check_structure
 from .structure import constant_fault, Fault, FRICTION, noises_commute
 from .structure import separable_fault
 from .structure import which_need_truncation, with_truncation
-from .symplectic_gradients import IndexedNoise, slow_apart
+from .symplectic_gradients import AbstractFriction, IndexedNoise
 from .vector_fields import apply, apply_one, check_terms_fit_state, rate, tree_sum
 from .waves import from_pair, to_pair, wave_terms

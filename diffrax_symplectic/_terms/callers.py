@@ -34,7 +34,8 @@ class AbstractCaller(eqx.Module):
 # What holds functions of the user and calls them. These are no functions of the user
 # themselves, also where they stand in place of one, such as a `Drift` in an `ODETerm`.
 _PARTS = AbstractCaller, diffrax.AbstractTerm, diffrax.AbstractSolver
-_TERMS_OF_DIFFRAX = (
+_KNOWN_TERMS = (
+    AbstractCaller,
     diffrax.ODETerm,
     diffrax.ControlTerm,
     diffrax.MultiTerm,
@@ -55,14 +56,23 @@ def with_programs(terms: _T, t: RealScalarLike, y: Y, args: Args) -> _T:
     for part in _parts(terms):
         if isinstance(part, AbstractCaller):
             check_pair(y)
-        elif isinstance(part, diffrax.AbstractTerm) and _is_of_user(part):
-            programs[id(part)] = _TracedTerm.of(part, t, y, args)
+        is_term = isinstance(part, diffrax.AbstractTerm)
+        if is_term and not isinstance(part, _KNOWN_TERMS):
+            # A term of a class of the user's.
+            control = eqx.filter_eval_shape(part.contr, t, t)
+            programs[id(part)] = _TracedTerm(
+                part,
+                _traced_field(part.vf, t, y, args, identity=part),
+                traced(part.vf_prod, t, y, args, control, identity=part),
+            )
+        trace = _traced_field if isinstance(part, diffrax.ControlTerm) else traced
         for name, inputs in _called_with(part, t, y, args).items():
             fn = getattr(part, name)
             # A function may stand in several places, as the energy of a heat bath does. It
             # is traced once.
             if callable(fn) and not isinstance(fn, _PARTS) and id(fn) not in programs:
-                programs[id(fn)] = _program(part, name, inputs)
+                call = jtu.Partial(_call, name, fn)
+                programs[id(fn)] = trace(call, *inputs, identity=fn)
 
     def is_replaced(x: Any) -> bool:
         return id(x) in programs
@@ -97,15 +107,6 @@ def _called_with(
     if isinstance(part, diffrax.AbstractSolver) and hasattr(part, "flow"):
         return {"flow": (t, y, args)}
     return {}
-
-
-def _program(part: Any, name: str, inputs: tuple[Any, ...]) -> Callable:
-    """The program of the function in this field of a part."""
-    fn = getattr(part, name)
-    call = jtu.Partial(_call, name, fn)
-    if isinstance(part, diffrax.ControlTerm):
-        return _traced_field(call, *inputs, identity=fn)
-    return traced(call, *inputs, identity=fn)
 
 
 def _call(name: str, fn: Callable, *inputs: Any) -> PyTree[Array]:
@@ -161,17 +162,6 @@ class _TracedTerm(diffrax.AbstractTerm):
     field: Callable
     product: Traced
 
-    @staticmethod
-    def of(
-        term: diffrax.AbstractTerm, t: RealScalarLike, y: Y, args: Args
-    ) -> "_TracedTerm":
-        control = eqx.filter_eval_shape(term.contr, t, t)
-        return _TracedTerm(
-            term,
-            _traced_field(term.vf, t, y, args, identity=term),
-            traced(term.vf_prod, t, y, args, control, identity=term),
-        )
-
     def vf(self, t, y, args):
         return self.field(t, y, args)
 
@@ -183,7 +173,3 @@ class _TracedTerm(diffrax.AbstractTerm):
 
     def vf_prod(self, t, y, args, control):
         return self.product(t, y, args, control)
-
-
-def _is_of_user(term: diffrax.AbstractTerm) -> bool:
-    return not isinstance(term, _TERMS_OF_DIFFRAX)

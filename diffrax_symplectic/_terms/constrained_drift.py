@@ -44,7 +44,7 @@ class ConstrainedDrift(diffrax.AbstractTerm, AbstractCaller):
     def vf(self, t, y, args) -> PyTree[Array]:
         # Diffrax looks at the structure of the vector field before any solve, so the error
         # cannot be raised here. The values must not be used, hence NaN.
-        return jtu.tree_map(_nan_like, y)
+        return jtu.tree_map(lambda x: jnp.full_like(x, jnp.nan), y)
 
     def contr(self, t0, t1, **kwargs) -> Any:
         return self.drift.contr(t0, t1, **kwargs)
@@ -93,10 +93,6 @@ def check_unconstrained(terms: PyTree[diffrax.AbstractTerm], caller_name: str) -
     """Raises a `ValueError` if the terms have a constraint."""
     if constraint_of(terms) is not None:
         raise ValueError(f"`{caller_name}` takes no constrained terms. {KEEP}.")
-
-
-def _nan_like(x: Array) -> Array:
-    return jnp.full_like(x, jnp.nan)
 
 
 def _is_constrained(x: Any) -> bool:

@@ -1,13 +1,13 @@
 """Detects which inputs the results of a function depend on."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, TypeAlias
+from typing import Any
 
 import jax
 import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
-from .._compat import dce_jaxpr, Jaxpr, Literal
+from .._compat import ClosedJaxpr, dce_jaxpr, Jaxpr, Literal, results_of_program
 
 
 class Dependence:
@@ -67,9 +67,9 @@ _ELEMENTWISE = frozenset(
 # Operations whose parameters hold the program that they call.
 _CALLS = frozenset({"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"})
 
-# The number of the input whose entries the entries of an array depend on, each on the same
-# entry; `None` if it depends on no input.
-_Source: TypeAlias = int | None
+
+class _Source:
+    """An input. Values that are no `_Source` depend on no input."""
 
 
 class _MixesEntries(Exception):
@@ -80,63 +80,48 @@ def acts_elementwise(fn: Callable, x: PyTree[Array]) -> bool:
     """Whether each entry of `fn(x)`, in the structure of `x`, is known to depend on the
     same entry of `x` alone. Then its derivative is diagonal. The converse does not hold."""
     closed = jax.make_jaxpr(fn)(x)
-    # Each input is its own source.
-    numbers = list(range(len(closed.jaxpr.invars)))
+    inputs = [_Source() for _ in closed.jaxpr.invars]
     try:
-        sources = _sources_of_results(closed.jaxpr, numbers)
+        results = _sources_of_results(closed, inputs)
     except _MixesEntries:
         return False
-    return all(
-        source is None or source == number for number, source in zip(numbers, sources)
-    )
+    pairs = zip(inputs, results)
+    return all(result is x or not isinstance(result, _Source) for x, result in pairs)
 
 
-def _sources_of_results(
-    jaxpr: Jaxpr, sources_of_inputs: Sequence[_Source]
-) -> list[_Source]:
-    """The source of each result of a program. Raises `_MixesEntries` if a result has no
-    single source, with each entry from the same entry."""
+def _sources_of_results(program: Any, sources: Sequence[Any]) -> list[Any]:
+    """For each result of a program the input whose entries its own depend on, each on the
+    same entry; no `_Source` if it depends on no input. Raises `_MixesEntries` if it depends
+    on inputs in any other way. `sources` are those of the inputs of the program."""
+    # Some operations hold the program with its constants, others without them.
+    jaxpr = getattr(program, "jaxpr", program)
     # Operations that no result needs are left out, since they may mix entries: the
     # derivative of a product of all entries also computes the product.
     jaxpr, read_inputs = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
-    pairs = zip(sources_of_inputs, read_inputs)
-    sources_of_read_inputs = [source for source, is_read in pairs if is_read]
-    source_of_variable = dict(zip(jaxpr.invars, sources_of_read_inputs))
+    read_sources = [source for source, is_read in zip(sources, read_inputs) if is_read]
+    closed = ClosedJaxpr(jaxpr, getattr(program, "consts", []))
+    return results_of_program(closed, read_sources, _sources_of_operation)
 
-    def source_of(x: Any) -> _Source:
-        # Constants of the program, and what follows from them alone, are not in the
-        # dictionary, and have no source.
-        return None if isinstance(x, Literal) else source_of_variable.get(x)
 
-    for eqn in jaxpr.eqns:
-        sources = [source_of(x) for x in eqn.invars]
-        distinct = {source for source in sources if source is not None}
-        if len(distinct) == 0:
-            continue
-        called = _called_by(eqn)
+def _sources_of_operation(eqn: Any, sources: list[Any]) -> list[Any]:
+    """`_sources_of_results` for one operation."""
+    distinct = {source for source in sources if isinstance(source, _Source)}
+    if len(distinct) == 0:
+        return [None for _ in eqn.outvars]
+    if eqn.primitive.name in _CALLS:
+        called = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
         if called is not None:
-            results = _sources_of_results(called, sources)
-            source_of_variable.update(zip(eqn.outvars, results))
-        elif len(distinct) == 1 and _is_elementwise(eqn, sources):
-            source_of_variable.update(dict.fromkeys(eqn.outvars, distinct.pop()))
-        else:
-            raise _MixesEntries
-    return [source_of(x) for x in jaxpr.outvars]
+            return _sources_of_results(called, sources)
+    if len(distinct) == 1 and _is_elementwise(eqn, sources):
+        return [*distinct] * len(eqn.outvars)
+    raise _MixesEntries
 
 
-def _called_by(eqn: Any) -> Jaxpr | None:
-    """The program that an operation calls with its own arguments, if it is such a call."""
-    if eqn.primitive.name not in _CALLS:
-        return None
-    called = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
-    # Some operations hold the program with its constants, others without them.
-    return getattr(called, "jaxpr", called)
-
-
-def _is_elementwise(eqn: Any, sources: Sequence[_Source]) -> bool:
+def _is_elementwise(eqn: Any, sources: list[Any]) -> bool:
     """Whether an operation keeps the entries of those arguments that have a source."""
     shape = eqn.outvars[0].aval.shape
-    tracked = [x for x, source in zip(eqn.invars, sources) if source is not None]
+    pairs = zip(eqn.invars, sources)
+    tracked = [x for x, source in pairs if isinstance(source, _Source)]
     if any(x.aval.shape != shape for x in tracked):
         return False
     if eqn.primitive.name == "dot_general":

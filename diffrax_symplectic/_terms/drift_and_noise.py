@@ -1,6 +1,7 @@
 """The terms of a system one by one: which are drifts, which are noises, and how many noises
-there are."""
+there are; and drifts taken apart."""
 
+import dataclasses
 from typing import Any
 
 import diffrax
@@ -9,10 +10,11 @@ import jax
 from jaxtyping import PyTree
 
 from .._brownian import num_noises
-from .._compat import is_adjoint_term, unwrapped
+from .._compat import is_adjoint_term, unwrapped, wrapped_like
 from .._custom_types import RealScalarLike, Terms
 from .constrained_drift import ConstrainedDrift
 from .paths import brownian_paths
+from .symplectic_gradients import AbstractFriction, Drift
 
 
 _BACKSOLVE = (
@@ -37,16 +39,12 @@ def split_terms(terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
     for place, term in enumerate(parts):
         # A term of another kind after the first may be driven by a path that Diffrax knows
         # nothing of. It must not pass for a drift: most solvers treat noise differently.
-        other_kind = place > 0 and not _is_ode(term)
-        if len(brownian_paths(term)) > 0 or other_kind:
+        is_ode = isinstance(unwrapped(term), diffrax.ODETerm | ConstrainedDrift)
+        if len(brownian_paths(term)) > 0 or (place > 0 and not is_ode):
             noise.append(term)
         else:
             drift.append(term)
     return tuple(drift), tuple(noise)
-
-
-def _is_ode(term: diffrax.AbstractTerm) -> bool:
-    return isinstance(unwrapped(term), diffrax.ODETerm | ConstrainedDrift)
 
 
 def flattened(terms: diffrax.AbstractTerm) -> Terms:
@@ -61,6 +59,51 @@ def field_of(term: diffrax.AbstractTerm) -> Any:
     other terms."""
     term = unwrapped(term)
     return term.vector_field if isinstance(term, diffrax.ODETerm) else None
+
+
+def _with_field(term: diffrax.AbstractTerm, field: Any) -> diffrax.AbstractTerm:
+    """An `ODETerm` of this vector field, in the direction of time of `term`."""
+    return wrapped_like(term, diffrax.ODETerm(field))
+
+
+def split_friction(terms: PyTree[diffrax.AbstractTerm]) -> tuple[Terms, Terms, Terms]:
+    """The drift without friction, the friction, and the noise."""
+    drift, noise = split_terms(terms)
+    return *friction_apart(drift), noise
+
+
+def friction_apart(drift: Terms) -> tuple[Terms, Terms]:
+    """The drift without friction, and the friction. A term may be a drift with friction, as
+    from `langevin_terms`, which is taken apart; friction alone, as from `bath_terms`; or a
+    drift without friction."""
+    rest = []
+    friction = []
+    for term in drift:
+        field = field_of(term)
+        if isinstance(field, Drift) and field.friction is not None:
+            frictionless = dataclasses.replace(field, friction=None)
+            rest.append(_with_field(term, frictionless))
+            friction.append(_with_field(term, field.friction))
+        elif isinstance(field, AbstractFriction):
+            friction.append(term)
+        else:
+            rest.append(term)
+    return tuple(rest), tuple(friction)
+
+
+def slow_apart(drift: Terms) -> tuple[Terms, Terms]:
+    """The terms of the drift without their slow potentials, and terms of these alone. The
+    drift must have no friction."""
+    rest = []
+    slow = []
+    for term in drift:
+        field = field_of(term)
+        if isinstance(field, Drift) and field.slow is not None:
+            rest.append(_with_field(term, dataclasses.replace(field, slow=None)))
+            slow.append(_with_field(term, dataclasses.replace(field, H0=None)))
+        else:
+            rest.append(term)
+    return tuple(rest), tuple(slow)
 
 
 def control_struct(

@@ -51,9 +51,10 @@ def call_user_function(
         raise
 
 
-def checked_energy(energy: PyTree, name: str = "H0") -> Array:
-    """The value of the user's Hamiltonian of this name, as a float. Raises a `ValueError`
-    if it is not a real scalar."""
+def checked_energy(name: str, H: Callable, *inputs: PyTree, args: Args) -> Array:
+    """The value of the user's Hamiltonian `H(*inputs, args)` of this name, as a float.
+    Raises a `ValueError` if it is not a real scalar."""
+    energy = call_user_function(name, H, *inputs, args=args)
     if not jtu.all_leaves([energy]) or jnp.shape(energy) != ():
         raise ValueError(
             f"`{name}` must return a scalar; got shape {shapes(energy)}. Sum over the "
@@ -67,12 +68,9 @@ def checked_energy(energy: PyTree, name: str = "H0") -> Array:
 
 def check_real_energies(name: str, energies: PyTree[Array]) -> None:
     """Raises a `ValueError` unless the user's Hamiltonians of this name are real."""
-    if not all(map(_is_real, jtu.tree_leaves(energies))):
+    leaves = jtu.tree_leaves(energies)
+    if not all(eqx.is_array_like(x) and not jnp.iscomplexobj(x) for x in leaves):
         raise ValueError(
             f"`{name}` must return real numbers; got {eqx.tree_pformat(energies)}. Take "
             "`jnp.real` of numbers that are mathematically real, such as <psi| A |psi>."
         )
-
-
-def _is_real(x: Any) -> bool:
-    return eqx.is_array_like(x) and not jnp.iscomplexobj(x)

@@ -55,9 +55,10 @@ def lifted_terms(
     path: diffrax.AbstractBrownianPath | PyTree | None,
     chart: Callable[[tuple[PyTree, PyTree]], PyTree],
     variable_name: str,
+    damped_drift: Callable | None,
 ) -> diffrax.MultiTerm:
     """The terms of Hamiltonians in the variable `chart((p, q))`, which messages call
-    `variable_name`."""
+    `variable_name`. The vector field `damped_drift` takes the place of that of `H0`."""
     check_takes("H0", H0, "t", variable_name, "args")
     if noise is None:
         if path is not None:
@@ -73,7 +74,10 @@ def lifted_terms(
     else:
         check_takes("noise", noise, "t", variable_name, "args")
         lifted_noise = Lifted(noise, chart)
-    return hamiltonian_terms(Lifted(H0, chart), lifted_noise, path)
+    terms = hamiltonian_terms(Lifted(H0, chart), lifted_noise, path)
+    if damped_drift is None:
+        return terms
+    return diffrax.MultiTerm(diffrax.ODETerm(damped_drift), *terms.terms[1:])
 
 
 def checked_damping(each: str, alpha: ArrayLike) -> ArrayLike:

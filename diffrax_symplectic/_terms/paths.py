@@ -34,7 +34,10 @@ def as_path(path: Any) -> diffrax.AbstractBrownianPath:
     """`path`, or an `UnspecifiedPath` for a shape. Otherwise raises a `ValueError`."""
     if isinstance(path, diffrax.AbstractBrownianPath):
         return path
-    if _is_shape(path):
+    is_tuple = isinstance(path, tuple) and all(isinstance(n, int) for n in path)
+    leaves = jtu.tree_leaves(path)
+    are_structs = all(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves)
+    if is_tuple or (len(leaves) > 0 and are_structs):
         return UnspecifiedPath(shape=checked_shape(path, "path"))
     is_class = isinstance(path, type)
     got = f"the class {path.__name__}" if is_class else f"a {type(path).__name__}"
@@ -43,15 +46,6 @@ def as_path(path: Any) -> diffrax.AbstractBrownianPath:
         f"shape `(m,)`; got {got}. (For a system without noise pass neither `noise` nor "
         "`path`.)"
     )
-
-
-def _is_shape(path: Any) -> bool:
-    """Whether this is `(m,)`, or a PyTree of `jax.ShapeDtypeStruct`s."""
-    if isinstance(path, tuple) and all(isinstance(n, int) for n in path):
-        return True
-    leaves = jtu.tree_leaves(path)
-    are_structs = all(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves)
-    return len(leaves) > 0 and are_structs
 
 
 def shapes_as_paths(terms: PyTree) -> PyTree:
@@ -70,7 +64,9 @@ def shapes_as_paths(terms: PyTree) -> PyTree:
 def which_are_shapes(terms: PyTree) -> list[bool]:
     """For each Brownian path of the terms, in order, whether the terms hold its shape
     instead of the path."""
-    return [_is_unspecified(path) for path in brownian_paths(shapes_as_paths(terms))]
+    return [
+        isinstance(x, UnspecifiedPath) for x in brownian_paths(shapes_as_paths(terms))
+    ]
 
 
 def brownian_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
@@ -87,21 +83,16 @@ def random_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
 def has_unknown_law(path: diffrax.AbstractBrownianPath) -> bool:
     """Whether the law of this path is not known here, as for the user's own classes, which
     need not be Brownian motions."""
-    return laws_of(path) is None and not _is_unspecified(path)
+    return laws_of(path) is None and not isinstance(path, UnspecifiedPath)
 
 
 def motion_numbers(paths: Sequence[diffrax.AbstractBrownianPath]) -> tuple[int, ...]:
     """The number of the Brownian motion that each path samples, counted from 0. Equal paths
     sample the same one; two shapes of paths never do."""
-    motions: list[diffrax.AbstractBrownianPath] = []
-    numbers = []
+    numbers: list[int] = []
     for path in paths:
-        matches = (k for k, motion in enumerate(motions) if _are_equal(path, motion))
-        number = next(matches, None)
-        if number is None:
-            number = len(motions)
-            motions.append(path)
-        numbers.append(number)
+        matches = (n for n, other in zip(numbers, paths) if _are_equal(path, other))
+        numbers.append(next(matches, max(numbers, default=-1) + 1))
     return tuple(numbers)
 
 
@@ -110,7 +101,7 @@ def _are_equal(
 ) -> bool:
     """Whether two paths are the same. The values of traced paths are not known: these are
     the same if they hold the same arrays."""
-    if _is_unspecified(path):
+    if isinstance(path, UnspecifiedPath):
         return False
     with at_trace_time():
         equal = eqx.tree_equal(path, other)
@@ -132,7 +123,7 @@ def with_paths_for_shapes(terms: PyTree, make_path: Callable) -> PyTree:
     """The terms with `make_path(shape, key)` in place of each shape of a path. The keys
     differ: each shape is a Brownian motion of its own."""
     terms = shapes_as_paths(terms)
-    has_only_shapes = all(map(_is_unspecified, brownian_paths(terms)))
+    has_only_shapes = all(which_are_shapes(terms))
     seeds = itertools.count(0 if has_only_shapes else _SEED_BESIDE_OTHERS)
 
     def new_path(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
@@ -180,21 +171,14 @@ def with_keys(terms: PyTree[diffrax.AbstractTerm], keys: list[Array]) -> PyTree:
     """The terms with these keys, from `path_keys`, in their paths."""
     remaining_keys = iter(keys)
 
-    def with_next_key(x: Any) -> Any:
-        return next(remaining_keys) if is_key(x) else x
+    def with_next_keys(path: diffrax.AbstractBrownianPath) -> PyTree:
+        return jtu.tree_map(lambda x: next(remaining_keys) if is_key(x) else x, path)
 
-    def new_path(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
-        return jtu.tree_map(with_next_key, path)
-
-    return replace_paths(terms, new_path)
+    return replace_paths(terms, with_next_keys)
 
 
 def _is_path(x: Any) -> bool:
     return isinstance(x, diffrax.AbstractBrownianPath)
-
-
-def _is_unspecified(path: Any) -> bool:
-    return isinstance(path, UnspecifiedPath)
 
 
 def _is_control(x: Any) -> bool:

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, PyTree
 from .._arguments import check_pair
 from .._custom_types import Args, RealScalarLike
 from .callers import AbstractCaller
-from .evaluation import call_user_function, checked_energy
+from .evaluation import checked_energy
 from .lifted import checked_damping, damping_for, lifted_terms
 
 
@@ -78,11 +78,8 @@ def spin_terms(
     damping; [Brown (1963)](https://doi.org/10.1103/PhysRev.130.1677) for spins at finite
     temperature.
     """
-    terms = lifted_terms(H0, noise, path, from_spinors, "s")
-    if damping is None:
-        return terms
-    drift = diffrax.ODETerm(_DampedPrecession(H0, damping))
-    return diffrax.MultiTerm(drift, *terms.terms[1:])
+    damped_drift = None if damping is None else _DampedPrecession(H0, damping)
+    return lifted_terms(H0, noise, path, from_spinors, "s", damped_drift)
 
 
 _EACH = "each spin"
@@ -102,7 +99,7 @@ class _DampedPrecession(AbstractCaller):
         s = from_spinors(y)
 
         def energy(s: _Spins) -> Array:
-            return checked_energy(call_user_function("H0", self.H0, t, s, args=args))
+            return checked_energy("H0", self.H0, t, s, args=args)
 
         gradient = jax.grad(energy)(s)
         alpha = damping_for(_EACH, self.alpha, s.shape[:-1], s.dtype)

@@ -2,11 +2,10 @@
 values. (`_solver/driven.py` draws them for a step.)"""
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
-import jax
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import numpy as np
@@ -50,78 +49,87 @@ def step_variables(
 ) -> StepVariables:
     """The variables of a step of size `h`. `numbers` are the `motion_numbers` of the paths
     of the terms. By default they are found by comparing keys; where keys are traced, they
-    have to be given."""
-    paths = _paths_of_known_laws(terms)
-    numbers = _checked_numbers(paths) if numbers is None else numbers
+    have to be given.
+
+    Raises a `ValueError` if the terms hold no Brownian paths, if the law of one is not
+    known, or if there are several whose traced keys would have to be compared."""
+    paths = brownian_paths(shapes_as_paths(terms))
+    if any(isinstance(path, UnspecifiedPath) for path in paths):
+        raise ValueError(
+            f"{ONLY_A_SHAPE} For the random variables of a step, pass "
+            "`path=solver.path(shape, key)` to the function that makes the terms."
+        )
+    unknown = [path for path in paths if laws_of(path) is None]
+    if len(paths) == 0 or len(unknown) > 0:
+        names = [
+            f"{type(path).__name__} with {getattr(path.levy_area, '__name__', '?')}"
+            for path in unknown
+        ]
+        raise ValueError(
+            "`terms` must hold Brownian paths whose laws are known, a `WeakBrownianPath` "
+            "or a Gaussian path with `levy_area=BrownianIncrement`, `SpaceTimeLevyArea` or "
+            "`SpaceTimeTimeLevyArea`, also within a `PlateauBrownianPath`; got "
+            f"{names}. (For a system without noise, pass a noise that is zero, such as "
+            "`0 * q`.)"
+        )
+    if numbers is None:
+        # It is not known which paths with traced keys are the same.
+        if len(paths) > 1 and any(map(is_traced, jtu.tree_leaves(paths))):
+            raise ValueError(
+                "`terms` hold several Brownian paths with traced keys, of which it is not "
+                "known whether they are the same. Construct the terms outside of "
+                "`jax.jit`, and let the function close over them."
+            )
+        numbers = motion_numbers(paths)
     # Paths with the same number are one Brownian motion, whose variables are drawn once.
-    first_paths = [paths[numbers.index(number)] for number in range(max(numbers) + 1)]
-    motions = [_Motion.of(path) for path in first_paths]
-    ends = np.cumsum([motion.num_variables for motion in motions])
+    motions = [paths[numbers.index(number)] for number in range(max(numbers) + 1)]
+    laws_of_motions = [_law_of_each_variable(path) for path in motions]
+    ends = np.cumsum([len(laws) for laws in laws_of_motions])
 
     def terms_with(
         values: Float[Array | np.ndarray, " n"],
     ) -> PyTree[diffrax.AbstractTerm]:
         pieces = jnp.split(values, ends[:-1])
-        given_paths = [
-            motion.path_with(piece, h) for motion, piece in zip(motions, pieces)
-        ]
+        given_paths = [_path_with(path, x, h) for path, x in zip(motions, pieces)]
         # `replace_paths` visits paths in the order of `paths`.
         remaining_numbers = iter(numbers)
+        return replace_paths(terms, lambda _: given_paths[next(remaining_numbers)])
 
-        def new_path(path: diffrax.AbstractBrownianPath) -> GivenPath:
-            del path
-            return given_paths[next(remaining_numbers)]
-
-        return replace_paths(terms, new_path)
-
-    laws = tuple(law for motion in motions for law in motion.law_of_each)
-    return StepVariables(laws, terms_with)
+    return StepVariables(tuple(itertools.chain(*laws_of_motions)), terms_with)
 
 
-class _Motion(NamedTuple):
-    """One of the Brownian motions of a step.
+def _law_of_each_variable(path: diffrax.AbstractBrownianPath) -> list[AbstractLaw]:
+    """The law of each random variable of a step: each attribute of an increment has one for
+    each noise."""
+    laws: Any = laws_of(path)
+    m = num_noises(increment_struct(path))
+    return [law for law in laws.values() for _ in range(m)]
 
-    - `path`: a path that samples it.
-    - `laws`: the laws of the attributes of its increments, in their order.
-    - `shape`: the shape of an increment.
-    - `num_noises`: the number of noises, each of which has a variable with each law.
-    """
 
-    path: diffrax.AbstractBrownianPath
-    laws: Mapping[str, AbstractLaw]
-    shape: PyTree[jax.ShapeDtypeStruct]
-    num_noises: int
+def _path_with(
+    path: diffrax.AbstractBrownianPath, values: Float[Array, " n"], h: RealScalarLike
+) -> GivenPath:
+    """A path like this one, with these variables, in units of the root of `h`, in every
+    step."""
+    laws: Any = laws_of(path)
+    shape = increment_struct(path)
+    zeros, unravel = zeros_and_unravel(shape)
+    scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(zeros.dtype)
+    # (laws, noises): a row is one attribute of the increment.
+    rows = scaled.reshape(-1, zeros.size)
+    attributes = {name: unravel(row) for name, row in zip(laws, rows)}
+    make_increment: Any = path.levy_area
+    increment = make_increment(dt=step_size(h, shape), **attributes)
+    make = jtu.Partial(_same_increment, increment)
+    return GivenPath(make=make, levy_area=type(increment))
 
-    @staticmethod
-    def of(path: diffrax.AbstractBrownianPath) -> "_Motion":
-        laws = laws_of(path)
-        assert laws is not None
-        shape = increment_struct(path)
-        return _Motion(path, laws, shape, num_noises(shape))
 
-    @property
-    def num_variables(self) -> int:
-        """The number of its random variables in a step."""
-        return len(self.laws) * self.num_noises
-
-    @property
-    def law_of_each(self) -> list[AbstractLaw]:
-        """The law of each of its random variables."""
-        return [law for law in self.laws.values() for _ in range(self.num_noises)]
-
-    def path_with(
-        self, values: Float[Array, " num_variables"], h: RealScalarLike
-    ) -> GivenPath:
-        """A path with these variables, in units of the root of `h`, in every step."""
-        zeros, unravel = zeros_and_unravel(self.shape)
-        scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(zeros.dtype)
-        # (laws, noises): a row is one attribute of the increment.
-        rows = scaled.reshape(-1, self.num_noises)
-        attributes = {name: unravel(row) for name, row in zip(self.laws, rows)}
-        make_increment: Any = self.path.levy_area
-        increment = make_increment(dt=step_size(h, self.shape), **attributes)
-        make = jtu.Partial(_same_increment, increment)
-        return GivenPath(make=make, levy_area=type(increment))
+def _same_increment(
+    increment: Any, t0: RealScalarLike, t1: RealScalarLike | None, use_levy: bool
+) -> Increment:
+    """The same increment over every step, with all of its attributes or `W` alone."""
+    del t0, t1
+    return increment if use_levy else increment.W
 
 
 def outcomes(
@@ -140,50 +148,3 @@ def outcomes(
     values = np.array([*itertools.product(*values_of_each)])
     weights = np.array([*itertools.product(*weights_of_each)])
     return values, np.prod(weights, axis=1)
-
-
-def _same_increment(
-    increment: Any, t0: RealScalarLike, t1: RealScalarLike | None, use_levy: bool
-) -> Increment:
-    """The same increment over every step, with all of its attributes or `W` alone."""
-    del t0, t1
-    return increment if use_levy else increment.W
-
-
-def _paths_of_known_laws(
-    terms: PyTree[diffrax.AbstractTerm],
-) -> list[diffrax.AbstractBrownianPath]:
-    """The Brownian paths of the terms. Raises a `ValueError` if there are none, or if the
-    law of one is not known."""
-    paths = brownian_paths(shapes_as_paths(terms))
-    if any(isinstance(path, UnspecifiedPath) for path in paths):
-        raise ValueError(
-            f"{ONLY_A_SHAPE} For the random variables of a step, pass "
-            "`path=solver.path(shape, key)` to the function that makes the terms."
-        )
-    unknown = [path for path in paths if laws_of(path) is None]
-    if len(paths) == 0 or len(unknown) > 0:
-        raise ValueError(
-            "`terms` must hold Brownian paths whose laws are known, a `WeakBrownianPath` "
-            "or a Gaussian path with `levy_area=BrownianIncrement`, `SpaceTimeLevyArea` or "
-            "`SpaceTimeTimeLevyArea`, also within a `PlateauBrownianPath`; got "
-            f"{[_name_of(path) for path in unknown]}. (For a system without noise, pass a "
-            "noise that is zero, such as `0 * q`.)"
-        )
-    return paths
-
-
-def _checked_numbers(paths: list[diffrax.AbstractBrownianPath]) -> tuple[int, ...]:
-    """The `motion_numbers` of paths. Raises a `ValueError` if there are several and they
-    are traced, since it is then not known which are the same."""
-    if len(paths) > 1 and any(map(is_traced, jtu.tree_leaves(paths))):
-        raise ValueError(
-            "`terms` hold several Brownian paths with traced keys, of which it is not "
-            "known whether they are the same. Construct the terms outside of `jax.jit`, "
-            "and let the function close over them."
-        )
-    return motion_numbers(paths)
-
-
-def _name_of(path: diffrax.AbstractBrownianPath) -> str:
-    return f"{type(path).__name__} with {getattr(path.levy_area, '__name__', '?')}"

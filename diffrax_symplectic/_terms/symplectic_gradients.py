@@ -1,10 +1,11 @@
-"""Vector fields from Hamiltonians, by `jax.grad`: of a drift, of its slow potential, of the
-noise. And what terms tell of the Hamiltonians that they come from."""
+"""Vector fields from Hamiltonians, by `jax.grad`: of a drift, also with friction, and of
+the noise. And what terms tell of the Hamiltonians that they come from."""
 
-import dataclasses
+import abc
 import functools as ft
+import operator
 from collections.abc import Callable
-from typing import Any, Literal, TYPE_CHECKING
+from typing import Any, ClassVar, Literal, TYPE_CHECKING
 
 import diffrax
 import equinox as eqx
@@ -15,12 +16,11 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree, Shaped
 
 from .._arguments import check_pair, shapes, whole_number
-from .._brownian import increment_struct
-from .._compat import wrapped_like, ω
-from .._custom_types import Args, BM, IntScalarLike, RealScalarLike, Terms
+from .._brownian import increment_struct, num_noises, zeros_and_unravel
+from .._compat import ω
+from .._custom_types import Args, BM, IntScalarLike, RealScalarLike
 from .callers import AbstractCaller
 from .dependence import Dependence
-from .drift_and_noise import field_of
 from .evaluation import call_user_function, check_real_energies, checked_energy
 
 
@@ -48,13 +48,28 @@ class IndexedNoise(AbstractCaller):
     """
 
     H: Callable[[IntScalarLike, RealScalarLike, PyTree, PyTree, Args], Array]
-    m: int = eqx.field(static=True, converter=ft.partial(whole_number, "m"))
+    m: int = eqx.field(static=True)
 
-    def __check_init__(self):
-        if not callable(self.H):
+    def __init__(
+        self,
+        H: Callable[[IntScalarLike, RealScalarLike, PyTree, PyTree, Args], Array],
+        m: int,
+    ):
+        """**Arguments:**
+
+        - `H`: `H(k, t, p, q, args)`, the Hamiltonian of noise `k`, a scalar. A function, or
+            a Module with parameters. `k` is a traced integer from `0` to `m - 1`.
+        - `m`: the number of noises.
+
+        **Raises:** a `ValueError` if `H` is not callable or `m` is not a positive integer;
+        and, while the solve is traced, if `H` does not return a scalar.
+        """
+        if not callable(H):
             raise ValueError(
-                f"`H` must be a function `H(k, t, p, q, args)`; got {self.H!r}."
+                f"`H` must be a function `H(k, t, p, q, args)`; got {H!r}."
             )
+        self.H = H
+        self.m = whole_number("m", m)
 
     def called_with(self, t, y, args):
         return {"H": (jax.ShapeDtypeStruct((), jnp.int32), t, *y, args)}
@@ -63,23 +78,11 @@ class IndexedNoise(AbstractCaller):
         self, k: IntScalarLike, t: RealScalarLike, p: PyTree, q: PyTree, args: Args
     ) -> Array:
         """`H_k`, for `k` from 0 to `m - 1`. Raises a `ValueError` if it is not a scalar."""
-        value = call_user_function("H", self.H, k, t, p, q, args=args)
-        return checked_energy(value, name="H")
+        return checked_energy("H", self.H, k, t, p, q, args=args)
 
     def __call__(self, t: RealScalarLike, p: PyTree, q: PyTree, args: Args) -> Array:
         indices = jnp.arange(self.m)
         return jax.vmap(lambda k: self.one(k, t, p, q, args))(indices)
-
-
-IndexedNoise.__init__.__doc__ = """**Arguments:**
-
-- `H`: `H(k, t, p, q, args)`, the Hamiltonian of noise `k`, a scalar. A function, or a
-    Module with parameters. `k` is a traced integer from `0` to `m - 1`.
-- `m`: the number of noises.
-
-**Raises:** a `ValueError` if `H` is not callable or `m` is not a positive integer; and,
-while the solve is traced, if `H` does not return a scalar.
-"""
 
 
 class OneNoise(eqx.Module):
@@ -93,14 +96,40 @@ class OneNoise(eqx.Module):
     increment: RealScalarLike
 
 
-class Drift(AbstractCaller):
-    """The vector field `(-dH0/dq, dH0/dp)`, where `slow` is a part of `H0`."""
+class AbstractFriction(AbstractCaller):
+    """A vector field `(-G v, 0)` with the velocities `v`."""
 
-    H0: Hamiltonian
+    @abc.abstractmethod
+    def velocity(self, t: RealScalarLike, y: _State, args: Args) -> Momenta:
+        """The velocities `v` of the state `y = (p, q)`."""
+
+    @abc.abstractmethod
+    def force(
+        self, t: RealScalarLike, q: Momenta, args: Args, velocity: Momenta
+    ) -> Momenta:
+        """`-G v` at the positions `q`, for `v = velocity`."""
+
+    def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
+        """`(-G v, 0)`."""
+        check_pair(y)
+        _, q = y
+        force = self.force(t, q, args, self.velocity(t, y, args))
+        return force, jtu.tree_map(jnp.zeros_like, q)
+
+
+class Drift(AbstractCaller):
+    """The vector field `(-dH/dq, dH/dp)` of the energy `H`, which is `H0`, the potential
+    `slow`, or the sum of both; and friction on its velocities `dH/dp`, if there is any.
+
+    Friction is in the same term, since the solvers of Diffrax for stochastic equations take
+    one drift and one noise."""
+
+    H0: Hamiltonian | None
     structure: AssertedStructure | None = eqx.field(static=True, default=None)
     # The user's function call that took `structure`, for messages.
     made_by: str = eqx.field(static=True, default="hamiltonian_terms")
     slow: Callable | None = None
+    friction: AbstractFriction | None = None
 
     def called_with(self, t, y, args):
         p, q = y
@@ -109,61 +138,40 @@ class Drift(AbstractCaller):
     def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
         check_pair(y)
 
-        def total_energy(p: Momenta, q: Momenta) -> Array:
-            value = call_user_function("H0", self.H0, t, p, q, args=args)
-            energy = checked_energy(value)
-            if self.slow is None:
-                return energy
-            return energy + _slow_energy(self.slow, t, q, args)
+        def energy(p: Momenta, q: Momenta) -> Array:
+            energies = []
+            if self.H0 is not None:
+                energies.append(checked_energy("H0", self.H0, t, p, q, args=args))
+            if self.slow is not None:
+                energies.append(checked_energy("slow", self.slow, t, q, args=args))
+            return ft.reduce(operator.add, energies)
 
-        return symplectic_gradient(total_energy, y)
-
-
-class SlowForce(eqx.Module):
-    """The vector field `(-dU/dq, 0)` of a potential `slow(t, q, args)`."""
-
-    slow: Callable
-
-    def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
-        check_pair(y)
-        p, q = y
-
-        def energy(q: Momenta) -> Array:
-            return _slow_energy(self.slow, t, q, args)
-
-        return (-(jax.grad(energy)(q) ** ω)).ω, jtu.tree_map(jnp.zeros_like, p)
-
-
-def _slow_energy(slow: Callable, t: RealScalarLike, q: Momenta, args: Args) -> Array:
-    """The value of the potential `slow`. Raises a `ValueError` if it is not a scalar."""
-    value = call_user_function("slow", slow, t, q, args=args)
-    return checked_energy(value, name="slow")
-
-
-def slow_apart(drift: Terms) -> tuple[Terms, Terms]:
-    """The terms of the drift without their slow potentials, and terms of these alone."""
-    rest = []
-    slow = []
-    for term in drift:
-        field = field_of(term)
-        if isinstance(field, Drift) and field.slow is not None:
-            fast = dataclasses.replace(field, slow=None)
-            # This keeps the direction of time, which Diffrax wraps around each term.
-            rest.append(wrapped_like(term, diffrax.ODETerm(fast)))
-            slow.append(wrapped_like(term, diffrax.ODETerm(SlowForce(field.slow))))
-        else:
-            rest.append(term)
-    return tuple(rest), tuple(slow)
+        dp, dq = symplectic_gradient(energy, y)
+        if self.friction is None:
+            return dp, dq
+        _, q = y
+        return (dp**ω + self.friction.force(t, q, args, dq) ** ω).ω, dq
 
 
 class AbstractNoise(diffrax.AbstractTerm, AbstractCaller):
-    """Noise with a Brownian path. Subclasses define `vf`, for each array of the state with
-    a trailing axis of noises, and `vf_prod`, which costs less."""
+    """Noise with a Brownian path. Subclasses define `vf_prod`, which costs less than `vf`:
+    this has a trailing axis of noises for each array of the state."""
 
     path: AbstractVar[diffrax.AbstractBrownianPath]
 
     def contr(self, t0: RealScalarLike, t1: RealScalarLike, **kwargs) -> BM:
         return self.path.evaluate(t0, t1, **kwargs)
+
+    def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
+        # Diffrax's own solvers ask for this if they take several stages with one field.
+        zeros, unravel = zeros_and_unravel(increment_struct(self.path))
+
+        def product(unit: Array) -> _State:
+            return self.vf_prod(t, y, args, unravel(unit))
+
+        # (noises, noises) to (*shape, noises) for each array of the state.
+        units = jnp.eye(zeros.size, dtype=zeros.dtype)
+        return jax.vmap(product, out_axes=-1)(units)
 
     def prod(self, vf: PyTree[Array], control: BM) -> PyTree[Array]:
         flat, _ = jfu.ravel_pytree(control)
@@ -177,119 +185,69 @@ class HamiltonianNoise(AbstractNoise):
     noise: Hamiltonian
     path: diffrax.AbstractBrownianPath
     structure: AssertedStructure | None = eqx.field(static=True, default=None)
+    made_by: ClassVar[str] = "hamiltonian_terms"
 
     def called_with(self, t, y, args):
-        # An `IndexedNoise` is not the user's function, but calls one.
-        if isinstance(self.noise, IndexedNoise):
-            return {}
         return {"noise": (t, *y, args)}
-
-    def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
-        # Diffrax's own solvers ask for this if they take several stages with one field.
-        hamiltonians = self._hamiltonians_at(t, y, args)
-
-        def flat_hamiltonians(y: _State) -> Array:
-            flat, _ = jfu.ravel_pytree(hamiltonians(y))
-            return flat
-
-        def noises_last(x: Array) -> Array:
-            return jnp.moveaxis(x, 0, -1)
-
-        # For each array of the state: (noises, *shape) to (*shape, noises).
-        by_p, by_q = jtu.tree_map(noises_last, jax.jacrev(flat_hamiltonians)(y))
-        return (-(by_q**ω)).ω, by_p
 
     def vf_prod(
         self, t: RealScalarLike, y: _State, args: Args, control: BM | OneNoise
     ) -> _State:
-        # The noise of a step is the gradient of one scalar, for any number of noises.
-        hamiltonians = self._hamiltonians_at(t, y, args)
-
-        def energy_of_one(p: Momenta, q: Momenta, one: OneNoise) -> Array:
-            if isinstance(self.noise, IndexedNoise):
-                H = self.noise.one(one.index, t, p, q, args)
-            else:
-                flat, _ = jfu.ravel_pytree(hamiltonians((p, q)))
-                H = flat[one.index]
-            return H * jnp.asarray(one.increment, H.dtype)
-
-        def dot(H: Array, increment: Array) -> Array:
-            return jnp.sum(H * increment.astype(H.dtype))
-
-        def energy(p: Momenta, q: Momenta) -> Any:
-            if isinstance(control, OneNoise):
-                return energy_of_one(p, q, control)
-            dots = jtu.tree_map(dot, hamiltonians((p, q)), control)
-            return sum(jtu.tree_leaves(dots))
-
-        return symplectic_gradient(energy, y)
-
-    def is_vf_expensive(self, t0, t1, y, args) -> bool:
-        # `vf` takes one reverse pass per noise, `vf_prod` a single one.
-        struct = increment_struct(self.path)
-        return sum(leaf.size for leaf in jtu.tree_leaves(struct)) > 2
-
-    def _hamiltonians_at(
-        self, t: RealScalarLike, y: _State, args: Args
-    ) -> Callable[[_State], PyTree[Array]]:
-        """The noise Hamiltonians at time `t`, as a function of the state. Raises a
-        `ValueError` if they do not depend on it. This traces them once more in every call,
-        but at run time costs nothing."""
         check_pair(y)
         struct = increment_struct(self.path)
 
-        def hamiltonians(state: _State) -> PyTree[Array]:
-            p, q = state
-            return self._evaluated_hamiltonians(t, p, q, args, struct)
+        def fits(H: Array, struct: jax.ShapeDtypeStruct) -> bool:
+            # The shapes of a single noise may differ: its Hamiltonian may be a scalar and
+            # its increment an array of one number, or the other way round.
+            return jnp.shape(H) == struct.shape or jnp.size(H) == struct.size == 1
+
+        def hamiltonians(p: Momenta, q: Momenta) -> PyTree[Array]:
+            """The noise Hamiltonians, in the structure and shapes of the path."""
+            if isinstance(self.noise, IndexedNoise):
+                # An `IndexedNoise` gives advice on the errors of its function by itself.
+                H = self.noise(t, p, q, args)
+            else:
+                H = call_user_function("noise", self.noise, t, p, q, args=args)
+            same_structure = jtu.tree_structure(H) == jtu.tree_structure(struct)
+            if not same_structure or not jtu.tree_all(jtu.tree_map(fits, H, struct)):
+                raise ValueError(
+                    "`noise` must return one Hamiltonian for each noise of the path, which "
+                    f"has shape {shapes(struct)}; got shape {shapes(H)}. Return an array "
+                    "of shape `(m,)` and construct the path with `shape=(m,)`."
+                )
+            check_real_energies("noise", H)
+            return jtu.tree_map(lambda leaf, s: jnp.reshape(leaf, s.shape), H, struct)
 
         # The gradient of such Hamiltonians is zero, so noise would be missing without an
-        # error.
-        if Dependence(hamiltonians, y).independent(of=lambda state: state):
+        # error. This traces them once more in every call, but at run time costs nothing.
+        if Dependence(hamiltonians, *y).independent(of=lambda p, q: (p, q)):
             raise ValueError(
                 "`noise` does not depend on the state, so there is no noise. Return "
                 "Hamiltonians, not amplitudes: for kicks of constant strength to each "
                 "momentum, dp_k = sigma_k dw_k, pass `noise = lambda t, p, q, args: -sigma "
                 "* q`. Without noise, solve the drift alone, `terms.terms[0]`."
             )
-        return hamiltonians
 
-    def _evaluated_hamiltonians(
-        self,
-        t: RealScalarLike,
-        p: Momenta,
-        q: Momenta,
-        args: Args,
-        struct: PyTree[jax.ShapeDtypeStruct],
-    ) -> PyTree[Array]:
-        """The noise Hamiltonians, in the structure and shapes of the path."""
-        if isinstance(self.noise, IndexedNoise):
-            # An `IndexedNoise` gives advice on the errors of its function by itself.
-            H = self.noise(t, p, q, args)
-        else:
-            H = call_user_function("noise", self.noise, t, p, q, args=args)
-        if not _has_one_for_each_noise(H, struct):
-            raise ValueError(
-                "`noise` must return one Hamiltonian for each noise of the path, which has "
-                f"shape {shapes(struct)}; got shape {shapes(H)}. Return an array of shape "
-                "`(m,)` and construct the path with `shape=(m,)`."
-            )
-        check_real_energies("noise", H)
-        return jtu.tree_map(lambda leaf, s: jnp.reshape(leaf, s.shape), H, struct)
+        def dot(H: Array, increment: Array) -> Array:
+            return jnp.sum(H * increment.astype(H.dtype))
 
+        # The noise of a step is the gradient of one scalar, for any number of noises.
+        def energy(p: Momenta, q: Momenta) -> Any:
+            if not isinstance(control, OneNoise):
+                dots = jtu.tree_map(dot, hamiltonians(p, q), control)
+                return sum(jtu.tree_leaves(dots))
+            if isinstance(self.noise, IndexedNoise):
+                H = self.noise.one(control.index, t, p, q, args)
+            else:
+                flat, _ = jfu.ravel_pytree(hamiltonians(p, q))
+                H = flat[control.index]
+            return H * jnp.asarray(control.increment, H.dtype)
 
-def _has_one_for_each_noise(
-    H: PyTree[Array], struct: PyTree[jax.ShapeDtypeStruct]
-) -> bool:
-    """Whether these are the noise Hamiltonians of a path with increments like `struct`."""
-    if jtu.tree_structure(H) != jtu.tree_structure(struct):
-        return False
-    for leaf, leaf_struct in zip(jtu.tree_leaves(H), jtu.tree_leaves(struct)):
-        # The shapes of a single noise may differ: its Hamiltonian may be a scalar and its
-        # increment an array of one number, or the other way round.
-        is_single = jnp.size(leaf) == leaf_struct.size == 1
-        if jnp.shape(leaf) != leaf_struct.shape and not is_single:
-            return False
-    return True
+        return symplectic_gradient(energy, y)
+
+    def is_vf_expensive(self, t0, t1, y, args) -> bool:
+        # `vf` takes one reverse pass per noise, `vf_prod` a single one.
+        return num_noises(increment_struct(self.path)) > 2
 
 
 def symplectic_gradient(energy: Callable, y: _State) -> _State:
@@ -299,42 +257,31 @@ def symplectic_gradient(energy: Callable, y: _State) -> _State:
     return (-(by_q**ω)).ω, by_p
 
 
+def hamiltonian_parts(
+    terms: PyTree[diffrax.AbstractTerm],
+) -> list[Drift | HamiltonianNoise]:
+    """The vector fields and noises in terms that come from Hamiltonians. The terms may be
+    wrapped or have friction."""
+    leaves = jtu.tree_leaves(terms, is_leaf=_is_hamiltonian_part)
+    return [x for x in leaves if _is_hamiltonian_part(x)]
+
+
+def _is_hamiltonian_part(x: Any) -> bool:
+    return isinstance(x, Drift | HamiltonianNoise)
+
+
 def is_hamiltonian(term: diffrax.AbstractTerm) -> bool:
     """Whether a term comes from Hamiltonians."""
-    return len(_hamiltonian_parts(term)) > 0
-
-
-def drift_hamiltonians(terms: PyTree[diffrax.AbstractTerm]) -> list[Hamiltonian]:
-    """The Hamiltonians of all drifts."""
-    return [part.H0 for part in _hamiltonian_parts(terms) if isinstance(part, Drift)]
+    return len(hamiltonian_parts(term)) > 0
 
 
 def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
     """The `structure` that the user asserted for a term, and for all parts of it."""
-    asserted = {part.structure for part in _hamiltonian_parts(term)}
+    asserted = {part.structure for part in hamiltonian_parts(term)}
     return asserted.pop() if len(asserted) == 1 else None
 
 
 def name_of_maker(term: diffrax.AbstractTerm) -> str | None:
     """The name of the function of this package that made a term from Hamiltonians and takes
     their `structure`, such as `"langevin_terms"`; `None` for other terms."""
-    drifts = [part for part in _hamiltonian_parts(term) if isinstance(part, Drift)]
-    if len(drifts) > 0:
-        return drifts[0].made_by
-    return "hamiltonian_terms" if is_hamiltonian(term) else None
-
-
-def _hamiltonian_parts(
-    term: PyTree[diffrax.AbstractTerm],
-) -> list[Drift | HamiltonianNoise]:
-    """The vector fields and noises in a term that come from Hamiltonians. The term may be
-    wrapped or have friction."""
-    return [
-        x
-        for x in jtu.tree_leaves(term, is_leaf=_is_hamiltonian_part)
-        if _is_hamiltonian_part(x)
-    ]
-
-
-def _is_hamiltonian_part(x: Any) -> bool:
-    return isinstance(x, Drift | HamiltonianNoise)
+    return next((part.made_by for part in hamiltonian_parts(term)), None)

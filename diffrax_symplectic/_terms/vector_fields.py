@@ -39,6 +39,26 @@ def apply_one(
 ) -> Y:
     """The vector field of one noise times its increment. `index` is that of the noise among
     the noises of all terms, in the order of their flattened controls."""
+
+    def product(term: diffrax.AbstractTerm, struct: PyTree, k: Any, w: Array) -> Y:
+        """The vector field of noise `k` of this term times its increment `w`. Where
+        possible no other noise is evaluated or multiplied."""
+        # Only the kind is read from the user's term. The term itself is called, which keeps
+        # the direction of time that Diffrax wraps around it.
+        if isinstance(unwrapped(term), HamiltonianNoise):
+            return term.vf_prod(t, y, args, OneNoise(k, w))
+        if isinstance(unwrapped(term), diffrax.ControlTerm):
+            field = term.vf(t, y, args)
+            # Lineax operators and other PyTrees cannot be indexed by the noise.
+            is_array = eqx.is_array(field) and isinstance(struct, jax.ShapeDtypeStruct)
+            # A scalar noise has no axis of noises to index.
+            if is_array and field.ndim > 0 and field.shape[-1:] == struct.shape:
+                return field[..., k] * w.astype(field.dtype)
+        # Everything else adds up all noises, so all increments but this one are zero.
+        zeros, unravel = zeros_and_unravel(struct)
+        increments = zeros.at[k].set(w.astype(zeros.dtype))
+        return term.vf_prod(t, y, args, unravel(increments))
+
     changes = []
     # The number of noises of the terms before this one.
     num_before = 0
@@ -49,42 +69,9 @@ def apply_one(
         is_in_term = (num_before <= index) & (index < num_before + num_in_term)
         index_in_term = jnp.clip(index - num_before, 0, num_in_term - 1)
         increment_or_zero = jnp.where(is_in_term, increment, 0)
-        changes.append(
-            _product_of_one_noise(
-                term, struct, index_in_term, increment_or_zero, args, t, y
-            )
-        )
+        changes.append(product(term, struct, index_in_term, increment_or_zero))
         num_before += num_in_term
     return _checked_sum(changes, y)
-
-
-def _product_of_one_noise(
-    term: diffrax.AbstractTerm,
-    struct: PyTree[jax.ShapeDtypeStruct],
-    index: IntScalarLike,
-    increment: Float[Array, ""],
-    args: Args,
-    t: RealScalarLike,
-    y: Y,
-) -> Y:
-    """The vector field of one noise of this term times its increment. `index` is that of
-    the noise in the flattened increments of the term, which have the shapes and dtypes of
-    `struct`. Where possible no other noise is evaluated or multiplied."""
-    # Only the kind is read from the user's term. The term itself is called, which keeps the
-    # direction of time that Diffrax wraps around it.
-    if isinstance(unwrapped(term), HamiltonianNoise):
-        return term.vf_prod(t, y, args, OneNoise(index, increment))
-    if isinstance(unwrapped(term), diffrax.ControlTerm):
-        field = term.vf(t, y, args)
-        # Lineax operators and other PyTrees cannot be indexed by the noise.
-        is_array = eqx.is_array(field) and isinstance(struct, jax.ShapeDtypeStruct)
-        # A scalar noise has no axis of noises to index.
-        if is_array and field.ndim > 0 and field.shape[-1:] == struct.shape:
-            return field[..., index] * increment.astype(field.dtype)
-    # Everything else adds up all noises, so all increments but this one are zero.
-    zeros, unravel = zeros_and_unravel(struct)
-    increments = zeros.at[index].set(increment.astype(zeros.dtype))
-    return term.vf_prod(t, y, args, unravel(increments))
 
 
 def rate(drift: Terms, t: RealScalarLike, y: Y, args: Args) -> Y:
@@ -133,34 +120,31 @@ def check_increments(terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> Non
         try:
             return term.prod(field, increments)
         except (TypeError, ValueError) as error:
-            raise _unfit_increments(field, increments, y0) from error
+            fitting_path = (
+                "Construct the path with the shape and dtype that the field takes"
+            )
+            if isinstance(field, lx.AbstractLinearOperator):
+                description = f"a Lineax operator on {_brief(field.in_structure())}"
+                advice = fitting_path
+            elif len(jtu.tree_leaves(y0)) > 1:
+                description = f"arrays {_brief(field)}"
+                advice = (
+                    "Of a state of several arrays the vector field must be a Lineax "
+                    "operator, such as a `lineax.FunctionLinearOperator` that maps the "
+                    "increments to a change of the state"
+                )
+            else:
+                description = f"an array {_brief(field)}"
+                advice = f"{fitting_path}, for an array the shape of its last axes"
+            raise ValueError(
+                f"A `ControlTerm` cannot multiply its vector field, {description}, by the "
+                f"increments of its path, {_brief(increments)}. {advice}."
+            ) from error
 
     # Tracing is enough: `product` raises.
     for term in terms:
         if isinstance(unwrapped(term), diffrax.ControlTerm):
             eqx.filter_eval_shape(product, term)
-
-
-def _unfit_increments(field: Any, increments: PyTree, y0: Y) -> ValueError:
-    """The error for a vector field that cannot be multiplied by these increments."""
-    fitting_path = "Construct the path with the shape and dtype that the field takes"
-    if isinstance(field, lx.AbstractLinearOperator):
-        description = f"a Lineax operator on {_brief(field.in_structure())}"
-        advice = fitting_path
-    elif len(jtu.tree_leaves(y0)) > 1:
-        description = f"arrays {_brief(field)}"
-        advice = (
-            "Of a state of several arrays the vector field must be a Lineax operator, such "
-            "as a `lineax.FunctionLinearOperator` that maps the increments to a change of "
-            "the state"
-        )
-    else:
-        description = f"an array {_brief(field)}"
-        advice = f"{fitting_path}, for an array the shape of its last axes"
-    return ValueError(
-        f"A `ControlTerm` cannot multiply its vector field, {description}, by the "
-        f"increments of its path, {_brief(increments)}. {advice}."
-    )
 
 
 def _brief(tree: PyTree) -> str:
@@ -179,22 +163,20 @@ def tree_sum(values: list[Y]) -> Y:
 def _checked_sum(changes: list[Y], y: Y) -> Y:
     """The sum of changes of the state `y`, at least one. Raises a `ValueError` unless each
     has the dtypes and shapes of the state; JAX raises its own for another structure."""
+
+    def check(change: Any, x: Any) -> None:
+        # Either may be a number of Python or NumPy. Of a weakly typed array
+        # `jnp.result_type` is the default dtype, not its own.
+        change = jnp.asarray(change)
+        x = jnp.asarray(x)
+        if (change.dtype, change.shape) != (x.dtype, x.shape):
+            raise ValueError(
+                f"The terms change an array of dtype and shape {x.dtype}{x.shape} by one "
+                f"of {change.dtype}{change.shape}. Give the state, the vector fields and "
+                "the path (as `shape=jax.ShapeDtypeStruct(shape, dtype)`) the same dtype, "
+                "and times a dtype that is not wider."
+            )
+
     for change in changes:
-        jtu.tree_map(_check_change, change, y)
+        jtu.tree_map(check, change, y)
     return tree_sum(changes)
-
-
-def _check_change(change: Any, x: Any) -> None:
-    """Raises a `ValueError` unless the change of an array `x` of the state has the dtype
-    and the shape of `x`."""
-    # Either may be a number of Python or NumPy. Of a weakly typed array `jnp.result_type`
-    # is the default dtype, not its own.
-    change = jnp.asarray(change)
-    x = jnp.asarray(x)
-    if (change.dtype, change.shape) != (x.dtype, x.shape):
-        raise ValueError(
-            f"The terms change an array of dtype and shape {x.dtype}{x.shape} by one "
-            f"of {change.dtype}{change.shape}. Give the state, the vector fields and "
-            "the path (as `shape=jax.ShapeDtypeStruct(shape, dtype)`) the same dtype, "
-            "and times a dtype that is not wider."
-        )

@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Complex, Float, PyTree
 from .._arguments import check_pair, shapes
 from .._custom_types import Args, RealScalarLike
 from .callers import AbstractCaller
-from .evaluation import call_user_function, checked_energy
+from .evaluation import checked_energy
 from .lifted import checked_damping, damping_for, lifted_terms
 
 
@@ -94,11 +94,8 @@ def wave_terms(
     Hamiltonians above generate unitary maps, so that solvers which conserve quadratic
     invariants keep the law of infinite temperature exactly.
     """
-    terms = lifted_terms(H0, noise, path, from_pair, "psi")
-    if damping is None:
-        return terms
-    drift = diffrax.ODETerm(_DampedWaves(H0, damping))
-    return diffrax.MultiTerm(drift, *terms.terms[1:])
+    damped_drift = None if damping is None else _DampedWaves(H0, damping)
+    return lifted_terms(H0, noise, path, from_pair, "psi", damped_drift)
 
 
 _EACH = "each vector of amplitudes"
@@ -126,7 +123,7 @@ class _DampedWaves(AbstractCaller):
 
         def energy(p: Array, q: Array) -> Array:
             psi = from_pair((p, q))
-            return checked_energy(call_user_function("H0", self.H0, t, psi, args=args))
+            return checked_energy("H0", self.H0, t, psi, args=args)
 
         by_p, by_q = jax.grad(energy, argnums=(0, 1))(p, q)
         vectors = jnp.shape(q)[:-1]

@@ -1,8 +1,6 @@
 """States that a constraint allows: found near others, and checked at the start of a
 solve."""
 
-from typing import Any
-
 import diffrax
 import equinox as eqx
 import jax
@@ -19,7 +17,7 @@ from ..._custom_types import Args, RealScalarLike
 from ..callers import with_programs
 from ..constrained_drift import constraint_of, without_constraint
 from ..dependence import Dependence
-from ..langevin import split_friction
+from ..drift_and_noise import split_friction
 from ..structure import separable_fault
 from ..vector_fields import check_terms_fit_state
 from .multipliers import Vector
@@ -54,13 +52,11 @@ def check_start(
     error when run, except in a batch: there the caller makes its path fail."""
     _check_constant_masses(terms, t0, y0, args)
     # Flags have no derivative, which `grad` would trace all the same.
-    fixed_y0, fixed_args = jtu.tree_map(_without_derivative, (y0, args))
+    fixed_y0, fixed_args = jtu.tree_map(
+        lambda x: lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, (y0, args)
+    )
     is_dependent, is_off = _start_faults(terms, t0, fixed_y0, fixed_args)
     return refused_where(is_dependent, _DEPENDENT), refused_where(is_off, _OFF)
-
-
-def _without_derivative(x: Any) -> Any:
-    return lax.stop_gradient(x) if eqx.is_inexact_array(x) else x
 
 
 # Without `jit` the operations of this function would be compiled one by one.

@@ -17,8 +17,8 @@ from ..._arguments import is_real_number
 from ..._custom_types import Args, RealScalarLike
 from ..._root_finder import max_norm, solve_matrix
 from ..constrained_drift import Constraint, constraint_of, without_constraint
+from ..drift_and_noise import split_friction
 from ..evaluation import call_user_function
-from ..langevin import split_friction
 from ..vector_fields import rate
 from .multipliers import (
     find_multipliers,

@@ -10,7 +10,7 @@ import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.tree_util as jtu
 import lineax as lx
-from jaxtyping import Array, ArrayLike, Bool, Float, PyTree
+from jaxtyping import Array, ArrayLike, Float, PyTree
 
 from ..._arguments import check_takes, checked_not_negative, shapes
 from ..._compat import is_traced
@@ -50,30 +50,32 @@ class FrictionAlong(AbstractCaller):
 
     directions: Value
 
+    def __init__(self, directions: Value):
+        """**Arguments:**
+
+        - `directions`: an array of shape `(*p.shape, m)` for `m` noises, or for momenta in
+            a PyTree a PyTree of such arrays; or a function `(t, q, args)` of these. In
+            units of the root of a friction, (force / velocity)^(1/2).
+        """
+        self.directions = directions
+
     def called_with(self, t, y, args):
         _, q = y
         return {"directions": (t, q, args)}
 
 
-FrictionAlong.__init__.__doc__ = """**Arguments:**
-
-- `directions`: an array of shape `(*p.shape, m)` for `m` noises, or for momenta in a PyTree
-    a PyTree of such arrays; or a function `(t, q, args)` of these. In units of the root of
-    a friction, (force / velocity)^(1/2).
-"""
-
-
 class _Matrix(eqx.Module):
-    """A constant matrix of friction, with what would take long in every step.
+    """A constant matrix of friction, for momenta as a vector, with what would take long in
+    every step. NaN if it is not symmetric positive semidefinite.
 
-    - `operator`: the matrix.
-    - `root`: its root, for momenta as a vector.
-    - `is_semidefinite`: whether it is symmetric positive semidefinite.
+    - `matrix`: the matrix.
+    - `root`: its root.
+    - `structure`: the structure, shapes and dtypes of the momenta.
     """
 
-    operator: lx.AbstractLinearOperator
+    matrix: Float[Array, "n n"]
     root: Float[Array, "n n"]
-    is_semidefinite: Bool[Array, ""]
+    structure: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
 
 
 def value_at(name: str, value: Any, t, q: _Momenta, args: Args) -> Any:
@@ -93,36 +95,22 @@ def product_with(
         # G v = sum_k d_k (d_k . v), which costs less than to form the matrix. In the scalar
         # products each array of momenta is one summand.
         columns = _checked_columns(friction, t, q, args)
-        speeds = jtu.tree_leaves(jtu.tree_map(_speeds_along, columns, velocity))
-        return jtu.tree_map(lambda directions: directions @ sum(speeds), columns)
-    value = value_at("friction", friction, t, q, args)
-    if isinstance(value, _Matrix):
-        force = _product_with_matrix(value.operator, q, velocity)
-        return jtu.tree_map(
-            lambda x: jnp.where(value.is_semidefinite, x, jnp.nan), force
+        speeds = jtu.tree_map(
+            lambda d, v: jnp.tensordot(v, d, axes=jnp.ndim(v)), columns, velocity
         )
-    if isinstance(value, lx.AbstractLinearOperator):
-        # Whether it is semidefinite is checked where the noise takes its root.
-        return _product_with_matrix(value, q, velocity)
+        total_speeds = sum(jtu.tree_leaves(speeds))
+        return jtu.tree_map(lambda directions: directions @ total_speeds, columns)
+    value = value_at("friction", friction, t, q, args)
+    if _is_matrix(value):
+        # Whether the value of a function is semidefinite is checked where the noise takes
+        # its root.
+        matrix = _checked_matrix(value, q, "the momenta")
+        flat_v, unravel = jfu.ravel_pytree(velocity)
+        return unravel(in_precision_of(matrix, flat_v) @ flat_v)
     values = _checked_numbers("friction", value, q)
     return jtu.tree_map(
         lambda g, v: not_negative(in_precision_of(g, v)) * v, values, velocity
     )
-
-
-def _speeds_along(
-    directions: Float[Array, "*shape m"], v: Float[Array, "*shape"]
-) -> Float[Array, " m"]:
-    """The scalar product of each direction with the velocity."""
-    return jnp.tensordot(v, directions, axes=jnp.ndim(v))
-
-
-def _product_with_matrix(
-    operator: lx.AbstractLinearOperator, q: _Momenta, velocity: _Momenta
-) -> _Momenta:
-    _check_matrix(operator, q, "the momenta")
-    flat_v, unravel = jfu.ravel_pytree(velocity)
-    return unravel(in_precision_of(operator.as_matrix(), flat_v) @ flat_v)
 
 
 def root_product_with(
@@ -132,18 +120,35 @@ def root_product_with(
     if their shapes do not fit the friction or the momenta."""
     if isinstance(friction, FrictionAlong):
         columns = _checked_columns(friction, t, q, args)
-        return _noise_along(columns, _checked_single_temperature(T), control)
-    if not _same_shapes(control, q):
+        T = _checked_single_temperature(T)
+        flat_w, _ = jfu.ravel_pytree(control)
+        # The shape `(m,)` for `m` directions, which all arrays share.
+        noise_shape = jnp.shape(jtu.tree_leaves(columns)[0])[-1:]
+        if noise_shape != flat_w.shape:
+            raise ValueError(
+                "The `path` of `langevin_terms` must have one noise for each direction of "
+                f"the friction, shape {noise_shape}; got shape {shapes(control)}."
+            )
+
+        def kick_along(directions: Array) -> Array:
+            scale = _root(2 * in_precision_of(T, directions))
+            return directions @ (scale * in_precision_of(flat_w, directions))
+
+        return jtu.tree_map(kick_along, columns)
+    if not _have_same_shapes(control, q):
         raise ValueError(
             f"The `path` of `langevin_terms` must have the shape of `q`, {shapes(q)}; got "
             f"shape {shapes(control)}."
         )
     value = value_at("friction", friction, t, q, args)
-    if isinstance(value, _Matrix):
-        return _noise_of_matrix(value.root, T, control, q)
-    if isinstance(value, lx.AbstractLinearOperator):
-        _check_matrix(value, q, "the momenta")
-        return _noise_of_matrix(_root_of(value), T, control, q)
+    if _is_matrix(value):
+        matrix = _checked_matrix(value, q, "the momenta")
+        root = value.root if isinstance(value, _Matrix) else _root_of_matrix(matrix)
+        flat_q, unravel = jfu.ravel_pytree(q)
+        flat_w, _ = jfu.ravel_pytree(control)
+        scale = _root(2 * in_precision_of(_checked_single_temperature(T), flat_q))
+        w = in_precision_of(flat_w, flat_q)
+        return unravel(scale * (in_precision_of(root, flat_q) @ w))
     numbers = _checked_numbers("friction", value, q)
     temperatures = _checked_numbers("temperature", T, q)
 
@@ -155,49 +160,44 @@ def root_product_with(
     return jtu.tree_map(kick, numbers, temperatures, control, q)
 
 
-def _same_shapes(a: PyTree, b: PyTree) -> bool:
+def _have_same_shapes(a: PyTree, b: PyTree) -> bool:
     """Whether two PyTrees have the same structure and shapes."""
-    same_structure = jtu.tree_structure(a) == jtu.tree_structure(b)
-    return same_structure and _shapes_of(a) == _shapes_of(b)
+    equal = eqx.tree_equal(jtu.tree_map(jnp.shape, a), jtu.tree_map(jnp.shape, b))
+    return bool(equal)
 
 
-def _shapes_of(tree: PyTree) -> list[tuple[int, ...]]:
-    return [jnp.shape(leaf) for leaf in jtu.tree_leaves(tree)]
+def _is_matrix(friction: Any) -> bool:
+    return isinstance(friction, _Matrix | lx.AbstractLinearOperator)
 
 
-def _root_of(operator: lx.AbstractLinearOperator) -> Float[Array, "n n"]:
-    matrix = operator.as_matrix()
+def _root_of_matrix(matrix: Array) -> Float[Array, "n n"]:
     return semidefinite_root(jnp.asarray(matrix, jnp.result_type(matrix, float)))
 
 
-def _noise_of_matrix(
-    root: Float[Array, "n n"], T: PyTree, control: BM, q: _Momenta
-) -> _Momenta:
-    """`sqrt(2 T) L W` in the shapes of the positions, with the root `L` of the friction."""
-    flat_q, unravel = jfu.ravel_pytree(q)
-    flat_w, _ = jfu.ravel_pytree(control)
-    scale = _root(2 * in_precision_of(_checked_single_temperature(T), flat_q))
-    w = in_precision_of(flat_w, flat_q)
-    return unravel(scale * (in_precision_of(root, flat_q) @ w))
-
-
-def _noise_along(columns: _Momenta, T: ArrayLike, control: BM) -> _Momenta:
-    """`sqrt(2 T) sum_k d_k W_k`, with one increment for each direction. Raises a
-    `ValueError` if the path has another number of noises."""
-    flat, _ = jfu.ravel_pytree(control)
-    # The shape `(m,)` for `m` directions, which all arrays share.
-    noise_shape = jnp.shape(jtu.tree_leaves(columns)[0])[-1:]
-    if noise_shape != flat.shape:
+def _checked_matrix(
+    friction: _Matrix | lx.AbstractLinearOperator, momenta: PyTree, called: str
+) -> Array:
+    """The matrix of the friction, for momenta as a vector. Raises a `ValueError` unless an
+    operator is tagged as positive semidefinite, and maps PyTrees with the structure and
+    shapes of `momenta` to such PyTrees. The message calls these `called`."""
+    if isinstance(friction, _Matrix):
+        structure = friction.structure
+    elif lx.is_positive_semidefinite(friction):
+        structure = friction.in_structure()
+    else:
         raise ValueError(
-            "The `path` of `langevin_terms` must have one noise for each direction of the "
-            f"friction, shape {noise_shape}; got shape {shapes(control)}."
+            "The operator of `friction` must be tagged as positive semidefinite: pass "
+            f"{_PASS_MATRIX}."
         )
-
-    def kick(directions: Array) -> Array:
-        scale = _root(2 * in_precision_of(T, directions))
-        return directions @ (scale * in_precision_of(flat, directions))
-
-    return jtu.tree_map(kick, columns)
+    if not _have_same_shapes(structure, momenta):
+        raise ValueError(
+            f"The operator of `friction` must act on arrays with the shape of {called}, "
+            f"{shapes(momenta)}; got one for shape {shapes(structure)}. For momenta of "
+            "shape `(n, d)` pass `lineax.PyTreeLinearOperator(array, jax.eval_shape("
+            "lambda: q), lineax.positive_semidefinite_tag)` with an array of shape "
+            "`(n, d, n, d)`."
+        )
+    return friction.matrix if isinstance(friction, _Matrix) else friction.as_matrix()
 
 
 def _checked_columns(friction: FrictionAlong, t, q: _Momenta, args: Args) -> _Momenta:
@@ -205,14 +205,13 @@ def _checked_columns(friction: FrictionAlong, t, q: _Momenta, args: Args) -> _Mo
     a `ValueError` if their shapes do not fit the momenta."""
     columns = value_at("directions", friction.directions, t, q, args)
     columns = _value_for_each("directions", columns, q)
-    column_shapes = _shapes_of(columns)
+
+    def fits(column: ArrayLike, momenta: Array) -> bool:
+        return jnp.ndim(column) > 0 and jnp.shape(column)[:-1] == jnp.shape(momenta)
+
     # All arrays have the same directions, so their last axes agree.
-    has_one_number = len({shape[-1:] for shape in column_shapes}) == 1
-    pairs = zip(column_shapes, _shapes_of(q))
-    fits_momenta = all(
-        len(shape) > 0 and shape[:-1] == momenta_shape for shape, momenta_shape in pairs
-    )
-    if not has_one_number or not fits_momenta:
+    last_axes = {jnp.shape(column)[-1:] for column in jtu.tree_leaves(columns)}
+    if len(last_axes) > 1 or not jtu.tree_all(jtu.tree_map(fits, columns, q)):
         raise ValueError(
             "`directions` of `FrictionAlong` must have the shape of the momenta and one "
             f"more axis, for the noises; got shape {shapes(columns)} for momenta of shape "
@@ -225,59 +224,34 @@ def _checked_numbers(
     name: str, value: PyTree, momenta: PyTree, called: str = "its momenta"
 ) -> PyTree:
     """The friction or temperature in the user's argument `name`, as numbers for each array
-    of the `momenta`. Raises a `ValueError` unless these are a single number or an array
-    that repeats along axes of the momenta. Messages call the momenta `called`, since a path
-    may stand in for them."""
+    of the `momenta`. Messages call the momenta `called`, since a path may stand in for
+    them.
+
+    Raises a `ValueError` unless these are a single number, or an array with as many axes as
+    the momenta, each as long as theirs or one. (NumPy would also add axes in front. So for
+    three particles in space `(3,)` would be one number for each axis of space, and more
+    often one for each particle is meant.)"""
     values = _value_for_each(name, value, momenta)
     for x, of_momenta in zip(jtu.tree_leaves(values), jtu.tree_leaves(momenta)):
-        _check_broadcasts(name, jnp.shape(x), jnp.shape(of_momenta), called)
+        shape = jnp.shape(x)
+        momenta_shape = jnp.shape(of_momenta)
+        fits = len(shape) == len(momenta_shape) and all(
+            length in (1, of_axis) for length, of_axis in zip(shape, momenta_shape)
+        )
+        if shape == () or fits:
+            continue
+        advice = ""
+        if len(momenta_shape) > 1 and shape == momenta_shape[:1]:
+            axes = ", ".join([":"] + ["None"] * (len(momenta_shape) - 1))
+            advice += f" For one number for each particle pass `{name}[{axes}]`."
+        if name == "friction" and len(shape) > 1:
+            advice += f" Pass {_PASS_MATRIX}."
+        raise ValueError(
+            f"An array of `{name}` must have the shape of {called}, {momenta_shape}, in "
+            "which any axis may have length one, or be a single number; got shape "
+            f"{shape}.{advice}"
+        )
     return values
-
-
-def _check_broadcasts(
-    name: str, shape: tuple[int, ...], momenta_shape: tuple[int, ...], called: str
-) -> None:
-    """Raises a `ValueError` unless an array of this shape has one number for all momenta,
-    or as many axes as these, each as long as theirs or one. (NumPy would also add axes in
-    front. So for three particles in space `(3,)` would be one number for each axis of
-    space, and more often one for each particle is meant.)"""
-    fits = len(shape) == len(momenta_shape) and all(
-        length in (1, of_momenta) for length, of_momenta in zip(shape, momenta_shape)
-    )
-    if shape == () or fits:
-        return
-    advice = ""
-    if len(momenta_shape) > 1 and shape == momenta_shape[:1]:
-        axes = ", ".join([":"] + ["None"] * (len(momenta_shape) - 1))
-        advice += f" For one number for each particle pass `{name}[{axes}]`."
-    if name == "friction" and len(shape) > 1:
-        advice += f" Pass {_PASS_MATRIX}."
-    raise ValueError(
-        f"An array of `{name}` must have the shape of {called}, {momenta_shape}, in which "
-        f"any axis may have length one, or be a single number; got shape {shape}.{advice}"
-    )
-
-
-def _check_matrix(
-    operator: lx.AbstractLinearOperator, momenta: PyTree, called: str
-) -> None:
-    """Raises a `ValueError` unless the operator is tagged as positive semidefinite, and
-    maps PyTrees with the structure and shapes of `momenta` to such PyTrees. The message
-    calls these `called`."""
-    if not lx.is_positive_semidefinite(operator):
-        raise ValueError(
-            "The operator of `friction` must be tagged as positive semidefinite: pass "
-            f"{_PASS_MATRIX}."
-        )
-    structure = operator.in_structure()
-    if not _same_shapes(structure, momenta):
-        raise ValueError(
-            f"The operator of `friction` must act on arrays with the shape of {called}, "
-            f"{shapes(momenta)}; got one for shape {shapes(structure)}. For momenta of "
-            "shape `(n, d)` pass `lineax.PyTreeLinearOperator(array, jax.eval_shape("
-            "lambda: q), lineax.positive_semidefinite_tag)` with an array of shape "
-            "`(n, d, n, d)`."
-        )
 
 
 def _value_for_each(name: str, value: PyTree, p: PyTree) -> PyTree:
@@ -339,12 +313,29 @@ def checked_friction(
 ) -> Any:
     """The friction, with the root of a constant matrix, for a path with increments like
     `path_struct`, or without a path. Raises a `ValueError` if it is known to be invalid."""
+    # The momenta are not known before the solve, and if their shape is another than the
+    # path's, either may be wrong: messages name both.
+    called = "the `path` and the momenta"
     if isinstance(friction, FrictionAlong):
-        if callable(friction.directions):
-            check_takes("directions", friction.directions, "t", "q", "args")
-        return jtu.tree_map(_as_array_or_function, friction)
+        if not callable(friction.directions):
+            return jtu.tree_map(jnp.asarray, friction)
+        check_takes("directions", friction.directions, "t", "q", "args")
+        return friction
     if isinstance(friction, lx.AbstractLinearOperator):
-        return _checked_matrix(friction, path_struct)
+        # Without a path the shapes of the momenta are known in the solve only. Here any
+        # fit.
+        structure = friction.in_structure()
+        momenta = structure if path_struct is None else path_struct
+        matrix = _checked_matrix(friction, momenta, called)
+        # The root of any other matrix than a semidefinite one is NaN.
+        root = _root_of_matrix(matrix)
+        is_semidefinite = ~jnp.any(jnp.isnan(root))
+        if not is_traced(is_semidefinite) and not is_semidefinite:
+            raise ValueError(
+                "`friction` must be a symmetric positive semidefinite matrix; got "
+                f"{matrix}."
+            )
+        return _Matrix(jnp.where(is_semidefinite, matrix, jnp.nan), root, structure)
     if callable(friction):
         check_takes("friction", friction, "t", "q", "args")
         return friction
@@ -355,41 +346,8 @@ def checked_friction(
             f"{friction!r}."
         )
     if path_struct is not None:
-        # The momenta are not known before the solve, and if their shape is another than the
-        # path's, either may be wrong: the message names both.
-        _checked_numbers(
-            "friction", friction, path_struct, "the `path` and the momenta"
-        )
-
-    def checked(numbers: ArrayLike) -> Array:
-        return jnp.asarray(
-            checked_not_negative("friction", numbers, expected=_EXPECTED)
-        )
-
-    return jtu.tree_map(checked, friction)
-
-
-def _as_array_or_function(x: Any) -> Any:
-    return x if callable(x) else jnp.asarray(x)
-
-
-def _checked_matrix(
-    operator: lx.AbstractLinearOperator,
-    path_struct: PyTree[jax.ShapeDtypeStruct] | None,
-) -> _Matrix:
-    """The matrix with its root. Raises a `ValueError` if it is known to be invalid."""
-    # Without a path the shapes of the momenta are known in the solve only. Here any fit.
-    momenta = operator.in_structure() if path_struct is None else path_struct
-    _check_matrix(operator, momenta, "the `path` and the momenta")
-    # The root of any other matrix than a semidefinite one is NaN.
-    root = _root_of(operator)
-    is_semidefinite = ~jnp.any(jnp.isnan(root))
-    if not is_traced(is_semidefinite) and not is_semidefinite:
-        raise ValueError(
-            "`friction` must be a symmetric positive semidefinite matrix; got "
-            f"{operator.as_matrix()}."
-        )
-    return _Matrix(operator, root, is_semidefinite)
+        _checked_numbers("friction", friction, path_struct, called)
+    return _checked_arrays("friction", friction)
 
 
 def checked_temperature(temperature: Any) -> Any:
@@ -397,11 +355,17 @@ def checked_temperature(temperature: Any) -> Any:
     if callable(temperature):
         check_takes("temperature", temperature, "t", "q", "args")
         return temperature
+    return _checked_arrays("temperature", temperature)
 
-    def checked(T: ArrayLike) -> Array:
-        return jnp.asarray(checked_not_negative("temperature", T, expected=_EXPECTED))
 
-    return jtu.tree_map(checked, temperature)
+def _checked_arrays(name: str, values: PyTree[ArrayLike]) -> PyTree[Array]:
+    """The numbers in the user's argument `name`, in arrays. Raises a `ValueError` if they
+    are known to be invalid."""
+
+    def checked(x: ArrayLike) -> Array:
+        return jnp.asarray(checked_not_negative(name, x, expected=_EXPECTED))
+
+    return jtu.tree_map(checked, values)
 
 
 # With `jit` this function is traced and compiled once for each shape.
@@ -439,7 +403,9 @@ def semidefinite_root(square: Float[Array, "n n"]) -> Float[Array, "n n"]:
         is_valid = is_valid & (pivot >= -rounding[j])
         return remainder, root.at[:, j].set(entries), is_valid
 
-    is_valid = _is_symmetric(square) & jnp.all(jnp.isfinite(square))
+    asymmetry = jnp.max(jnp.abs(square - square.T))
+    is_symmetric = asymmetry <= 100 * eps * jnp.max(jnp.abs(square))
+    is_valid = is_symmetric & jnp.all(jnp.isfinite(square))
     # The remainder, the root and whether the matrix may be semidefinite, before any column.
     carry = (square, jnp.zeros_like(square), is_valid)
     # The loop is unrolled for all matrices that the fused engine solves with: the engine
@@ -448,9 +414,3 @@ def semidefinite_root(square: Float[Array, "n n"]) -> Float[Array, "n n"]:
     remainder, root, is_valid = carry
     is_valid = is_valid & jnp.all(jnp.abs(remainder) <= largest_remainder)
     return jnp.where(is_valid, root, jnp.nan)
-
-
-def _is_symmetric(matrix: Float[Array, "n n"]) -> Bool[Array, ""]:
-    """Whether a matrix is symmetric up to rounding errors."""
-    rounding = 100 * jnp.finfo(matrix.dtype).eps * jnp.max(jnp.abs(matrix))
-    return jnp.max(jnp.abs(matrix - matrix.T)) <= rounding

@@ -1,6 +1,5 @@
 """Langevin dynamics: friction on velocities, and the noise of a temperature."""
 
-import abc
 import dataclasses
 from collections.abc import Callable
 from typing import Any
@@ -12,16 +11,14 @@ import jax.tree_util as jtu
 from jaxtyping import Array, PyTree
 
 from ..._arguments import check_pair, check_takes
-from ..._brownian import increment_struct, TruncatedBrownianPath, zeros_and_unravel
-from ..._compat import wrapped_like, ω
-from ..._custom_types import Args, BM, RealScalarLike, Terms
-from ..callers import AbstractCaller
+from ..._brownian import increment_struct, TruncatedBrownianPath
+from ..._compat import ω
+from ..._custom_types import Args, BM, RealScalarLike
 from ..constrained_drift import Constraint, with_constraint
-from ..drift_and_noise import field_of, split_terms
-from ..evaluation import call_user_function, checked_energy
+from ..evaluation import checked_energy
 from ..hamiltonian import hamiltonian_terms
 from ..paths import as_path
-from ..symplectic_gradients import AbstractNoise
+from ..symplectic_gradients import AbstractFriction, AbstractNoise
 from .friction import (
     checked_friction,
     checked_temperature,
@@ -120,11 +117,15 @@ def langevin_terms(
     where this is not known before.
     """
     (frictionless,) = hamiltonian_terms(H0, structure=structure, slow=slow).terms
-    field = dataclasses.replace(frictionless.vector_field, made_by="langevin_terms")
     friction_term, *noise = bath_terms(H0, friction, temperature, path).terms
-    field_with_friction = DriftWithFriction(field, friction_term.vector_field)
-    drift = with_constraint(diffrax.ODETerm(field_with_friction), constraint)
-    return diffrax.MultiTerm(drift, *noise)
+    field = dataclasses.replace(
+        frictionless.vector_field,
+        made_by="langevin_terms",
+        friction=friction_term.vector_field,
+    )
+    return diffrax.MultiTerm(
+        with_constraint(diffrax.ODETerm(field), constraint), *noise
+    )
 
 
 def bath_terms(
@@ -163,57 +164,6 @@ def bath_terms(
     return diffrax.MultiTerm(diffrax.ODETerm(field), noise)
 
 
-def split_friction(terms: PyTree[diffrax.AbstractTerm]) -> tuple[Terms, Terms, Terms]:
-    """The drift without friction, the friction, and the noise."""
-    drift, noise = split_terms(terms)
-    rest, friction = friction_apart(drift)
-    return rest, friction, noise
-
-
-def friction_apart(drift: Terms) -> tuple[Terms, Terms]:
-    """The drift without friction, and the friction. A term may be a drift with friction, as
-    from `langevin_terms`, which is taken apart; friction alone, as from `bath_terms`; or a
-    drift without friction."""
-    rest = []
-    friction = []
-    for term in drift:
-        field = field_of(term)
-        if isinstance(field, DriftWithFriction):
-            # This keeps the direction of time, which Diffrax wraps around each term.
-            rest.append(wrapped_like(term, diffrax.ODETerm(field.drift)))
-            friction.append(wrapped_like(term, diffrax.ODETerm(field.friction)))
-        elif isinstance(field, AbstractFriction):
-            friction.append(term)
-        else:
-            rest.append(term)
-    return tuple(rest), tuple(friction)
-
-
-class AbstractFriction(AbstractCaller):
-    """A vector field `(-G v, 0)` with the velocities `v`."""
-
-    @abc.abstractmethod
-    def velocity(
-        self, t: RealScalarLike, y: tuple[_Momenta, _Momenta], args: Args
-    ) -> _Momenta:
-        """The velocities `v` of the state `y = (p, q)`."""
-
-    @abc.abstractmethod
-    def force(
-        self, t: RealScalarLike, q: _Momenta, args: Args, velocity: _Momenta
-    ) -> _Momenta:
-        """`-G v` at the positions `q`, for `v = velocity`."""
-
-    def __call__(
-        self, t: RealScalarLike, y: tuple[_Momenta, _Momenta], args: Args
-    ) -> tuple[_Momenta, _Momenta]:
-        """`(-G v, 0)`."""
-        check_pair(y)
-        _, q = y
-        force = self.force(t, q, args, self.velocity(t, y, args))
-        return force, jtu.tree_map(jnp.zeros_like, q)
-
-
 class Friction(AbstractFriction):
     """The vector field `(-G dH0/dp, 0)`."""
 
@@ -228,30 +178,12 @@ class Friction(AbstractFriction):
         p, q = y
 
         def energy(p: _Momenta) -> Array:
-            return checked_energy(call_user_function("H0", self.H0, t, p, q, args=args))
+            return checked_energy("H0", self.H0, t, p, q, args=args)
 
         return jax.grad(energy)(p)
 
     def force(self, t, q, args, velocity):
         return (-(product_with(self.friction, t, q, args, velocity) ** ω)).ω
-
-
-class DriftWithFriction(AbstractCaller):
-    """A vector field with friction on its velocities `dq`, in one term: the solvers of
-    Diffrax for stochastic equations take one drift and one noise."""
-
-    drift: Callable
-    friction: AbstractFriction
-
-    def called_with(self, t, y, args):
-        # Both parts are callers, too.
-        return {}
-
-    def __call__(self, t: RealScalarLike, y: tuple[_Momenta, _Momenta], args: Args):
-        _, q = y
-        dp, dq = self.drift(t, y, args)
-        force = self.friction.force(t, q, args, dq)
-        return (dp**ω + force**ω).ω, dq
 
 
 class BathNoise(AbstractNoise):
@@ -264,18 +196,6 @@ class BathNoise(AbstractNoise):
     def called_with(self, t, y, args):
         _, q = y
         return {"friction": (t, q, args), "temperature": (t, q, args)}
-
-    def vf(
-        self, t: RealScalarLike, y: tuple[_Momenta, _Momenta], args: Args
-    ) -> PyTree[Array]:
-        zeros, unravel = zeros_and_unravel(increment_struct(self.path))
-
-        def product(unit: Array) -> tuple[_Momenta, _Momenta]:
-            return self.vf_prod(t, y, args, unravel(unit))
-
-        # (noises, noises) to (*shape, noises) for each array of the state.
-        units = jnp.eye(zeros.size, dtype=zeros.dtype)
-        return jax.vmap(product, out_axes=-1)(units)
 
     def vf_prod(
         self, t: RealScalarLike, y: tuple[_Momenta, _Momenta], args: Args, control: BM

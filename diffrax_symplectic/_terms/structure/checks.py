@@ -1,8 +1,6 @@
 """Checks that a system has the structure that a family of methods needs: by tracing what
 the vector fields depend on, or by the user's assertion."""
 
-import functools as ft
-from collections.abc import Callable
 from typing import Any, get_args, NamedTuple
 
 import diffrax
@@ -18,8 +16,12 @@ from ..._custom_types import Args, RealScalarLike, Terms, Y
 from ..._tableau import Structure
 from ..constrained_drift import without_constraint
 from ..dependence import Dependence
-from ..drift_and_noise import control_struct, split_terms
-from ..langevin import friction_apart, split_friction
+from ..drift_and_noise import (
+    control_struct,
+    friction_apart,
+    split_friction,
+    split_terms,
+)
 from ..lifted import has_lifted
 from ..paths import brownian_paths
 from ..symplectic_gradients import (
@@ -135,23 +137,75 @@ def separable_fault(
     it is."""
     if advice := pair_fault(y0):
         return Fault("the state is not a pair (p, q)", advice)
-
-    def trace(terms: Terms) -> list["_Traced"]:
-        to_trace = _not_asserted(terms, "separable")
-        return [_Traced(term, _dependence(term, t0, y0, args)) for term in to_trace]
-
     # Friction of `langevin_terms` is taken apart from its drift, which then is one of a
     # Hamiltonian, so that its faults are named as those of derivatives of H0.
     frictionless, friction = friction_apart(drift)
     if fault := _wrong_assertion("separable", frictionless, noise, t0, y0, args):
         return fault
-    drift_traces = trace((*frictionless, *friction))
-    noise_traces = trace(noise)
-    keeps_half = ft.partial(_keeps_half, t0, y0, args)
-    faults = _separable_faults(0, drift_traces, noise_traces, keeps_half)
+
+    def traced(terms: Terms) -> list[tuple[diffrax.AbstractTerm, Dependence]]:
+        """The terms whose structure the user has not asserted, each with what the change of
+        the state by it depends on."""
+        to_trace = [term for term in terms if asserted_structure(term) != "separable"]
+        return [(term, _dependence(term, t0, y0, args)) for term in to_trace]
+
+    traced_drift = traced((*frictionless, *friction))
+    traced_noise = traced(noise)
+    beside = " besides H0" if len(traced_drift) > 1 else ""
+
+    def faults_if(momenta: int) -> list[Fault]:
+        """All reasons why the system is not separable, if momenta are the half of the state
+        with this number, 0 or 1."""
+        positions = 1 - momenta
+
+        def depends(dependence: Dependence, half: int, on: str) -> bool:
+            """Whether the change of a half of the state depends on the momenta `"p"`, the
+            positions `"q"`, the time `"t"` or the `"control"`."""
+
+            def read(t: Any, y: Y, control: Any) -> PyTree:
+                inputs = dict(t=t, p=y[momenta], q=y[positions], control=control)
+                return inputs[on]
+
+            return not dependence.independent(read, lambda change: change[half])
+
+        # Which half depends on what, for `H0` and for the rates of change of plain terms.
+        rules = (
+            (momenta, "p", "dH0/dq depends on p", "dp/dt depend on p"),
+            (positions, "q", "dH0/dp depends on q", "dq/dt depend on q"),
+            (positions, "t", "dH0/dp depends on t", "dq/dt depend on t"),
+        )
+        faults = []
+        for term, dependence in traced_drift:
+            is_plain = not is_hamiltonian(term)
+            advice = _advice("separable", term)
+            for half, on, cause, of_plain in rules:
+                if not depends(dependence, half, on):
+                    continue
+                if is_plain:
+                    cause = f"a drift term{beside} makes {of_plain}"
+                # Friction in a plain term changes momenta by what depends on them.
+                by_friction = is_plain and half == momenta
+                faults.append(Fault(cause, advice, friction=by_friction))
+        for term, dependence in traced_noise:
+            # The change of q is linear in the increment, so it is zero if it does not
+            # depend on the increment.
+            may_move_q = depends(dependence, positions, "control")
+            if may_move_q and not _keeps_half(term, positions, t0, y0, args):
+                cause = "dH_k/dp is not zero"
+                of_plain = "a noise term changes q, the second half of the state"
+            elif depends(dependence, momenta, "p"):
+                cause = "dH_k/dq depends on p"
+                of_plain = "a noise term changes p by an amount that depends on p"
+            else:
+                continue
+            cause = cause if is_hamiltonian(term) else of_plain
+            faults.append(Fault(cause, _advice("separable", term)))
+        return faults
+
+    faults = faults_if(momenta=0)
     if len(faults) == 0:
         return None
-    faults_if_exchanged = _separable_faults(1, drift_traces, noise_traces, keeps_half)
+    faults_if_exchanged = faults_if(momenta=1)
     first = faults[0]
     by_friction = first._replace(advice=f"{FRICTION} {first.advice}", friction=True)
     if all(fault.friction for fault in faults):
@@ -165,119 +219,14 @@ def separable_fault(
     return first._replace(friction=False)
 
 
-class _Traced(NamedTuple):
-    """A term, and what the change of the state by it depends on."""
-
-    term: diffrax.AbstractTerm
-    dependence: Dependence
-
-
-class _Forbidden(NamedTuple):
-    """A dependence that no drift of a separable system has.
-
-    - `part`: selects a half of the change of the state.
-    - `of`: selects, of the inputs `(t, y, control)`, what it must not depend on.
-    - `derivative`: how a message states it of a Hamiltonian.
-    - `rate`: how a message states it of a plain term, after "makes".
-    - `by_friction`: whether friction in a plain term does this.
-    """
-
-    part: Callable
-    of: Callable
-    derivative: str
-    rate: str
-    by_friction: bool = False
-
-
-def _separable_faults(
-    momentum_half: int,
-    drift: list[_Traced],
-    noise: list[_Traced],
-    keeps_half: Callable[[diffrax.AbstractTerm, int], bool],
-) -> list[Fault]:
-    """All reasons why a system is not separable, if momenta are the half of the state with
-    this number, 0 or 1. `keeps_half` says whether a noise term leaves the half with a
-    number unchanged."""
-    of_drift = _faults_of_drift(momentum_half, drift)
-    return of_drift + _faults_of_noise(momentum_half, noise, keeps_half)
-
-
-def _faults_of_drift(momentum_half: int, drift: list[_Traced]) -> list[Fault]:
-    """`_separable_faults` of the drift."""
-    position_half = 1 - momentum_half
-    momenta = ft.partial(_half_of_state, momentum_half)
-    positions = ft.partial(_half_of_state, position_half)
-    change_of_momenta = ft.partial(_half_of_change, momentum_half)
-    change_of_positions = ft.partial(_half_of_change, position_half)
-    rules = (
-        _Forbidden(
-            part=change_of_momenta,
-            of=momenta,
-            derivative="dH0/dq depends on p",
-            rate="dp/dt depend on p",
-            by_friction=True,
-        ),
-        _Forbidden(
-            part=change_of_positions,
-            of=positions,
-            derivative="dH0/dp depends on q",
-            rate="dq/dt depend on q",
-        ),
-        _Forbidden(
-            part=change_of_positions,
-            of=_times,
-            derivative="dH0/dp depends on t",
-            rate="dq/dt depend on t",
-        ),
-    )
-    faults = []
-    beside = " besides H0" if len(drift) > 1 else ""
-    for term, dependence in drift:
-        is_plain = not is_hamiltonian(term)
-        advice = _advice("separable", term)
-        for rule in rules:
-            if not dependence.independent(rule.of, rule.part):
-                of_plain = f"a drift term{beside} makes {rule.rate}"
-                cause = of_plain if is_plain else rule.derivative
-                by_friction = is_plain and rule.by_friction
-                faults.append(Fault(cause, advice, friction=by_friction))
-    return faults
-
-
-def _faults_of_noise(
-    momentum_half: int,
-    noise: list[_Traced],
-    keeps_half: Callable[[diffrax.AbstractTerm, int], bool],
-) -> list[Fault]:
-    """`_separable_faults` of the noise."""
-    position_half = 1 - momentum_half
-    momenta = ft.partial(_half_of_state, momentum_half)
-    change_of_momenta = ft.partial(_half_of_change, momentum_half)
-    change_of_positions = ft.partial(_half_of_change, position_half)
-    faults = []
-    for term, dependence in noise:
-        is_plain = not is_hamiltonian(term)
-        advice = _advice("separable", term)
-        # The change of q is linear in the increment, so it is zero if it does not depend
-        # on the increment.
-        may_move_q = not dependence.independent(_increments, change_of_positions)
-        if may_move_q and not keeps_half(term, position_half):
-            of_plain = "a noise term changes q, the second half of the state"
-            cause = of_plain if is_plain else "dH_k/dp is not zero"
-            faults.append(Fault(cause, advice))
-        elif not dependence.independent(momenta, change_of_momenta):
-            of_plain = "a noise term changes p by an amount that depends on p"
-            cause = of_plain if is_plain else "dH_k/dq depends on p"
-            faults.append(Fault(cause, advice))
-    return faults
-
-
 def additive_fault(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
     """Why the noise is not additive; `None` if it does not depend on the state."""
     if fault := _wrong_assertion("additive", (), noise, t0, y0, args):
         return fault
-    for term in _not_asserted(noise, "additive"):
-        if not _dependence(term, t0, y0, args).independent(_states):
+    for term in noise:
+        if asserted_structure(term) == "additive":
+            continue
+        if not _dependence(term, t0, y0, args).independent(lambda t, y, control: y):
             gradient = " = (-dH_k/dq, dH_k/dp)" if is_hamiltonian(term) else ""
             cause = f"the noise b_k{gradient} depends on the state"
             return Fault(cause, _advice("additive", term))
@@ -287,7 +236,7 @@ def additive_fault(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> Fault
 def constant_fault(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
     """Why additive noise is not constant in time; `None` if it does not depend on time."""
     for term in noise:
-        if not _dependence(term, t0, y0, args).independent(_times):
+        if not _dependence(term, t0, y0, args).independent(lambda t, y, control: t):
             return Fault("it depends on time", "Use `SRKs4`, which accepts such noise.")
     return None
 
@@ -356,7 +305,7 @@ def _dependence(
 
 
 def _keeps_half(
-    t0: RealScalarLike, y0: Y, args: Args, term: diffrax.AbstractTerm, half: int
+    term: diffrax.AbstractTerm, half: int, t0: RealScalarLike, y0: Y, args: Args
 ) -> bool:
     """Whether a plain noise term leaves one half of the state unchanged because its matrix
     has a block of zeros that is known while tracing."""
@@ -377,34 +326,6 @@ def _keeps_half(
     return not any(is_traced(leaf) or np.asarray(leaf).any() for leaf in leaves)
 
 
-# Parts of the inputs of `_dependence`.
-def _times(t: Any, y: Y, control: Any) -> Any:
-    return t
-
-
-def _states(t: Any, y: Y, control: Any) -> Y:
-    return y
-
-
-def _increments(t: Any, y: Y, control: Any) -> Any:
-    return control
-
-
-def _half_of_state(half: int, t: Any, y: Y, control: Any) -> PyTree:
-    """A part of the inputs of `_dependence`."""
-    return y[half]
-
-
-def _half_of_change(half: int, change: Y) -> PyTree:
-    """A part of the result of `_dependence`, the change of the state."""
-    return change[half]
-
-
-def _not_asserted(terms: Terms, structure: str) -> list[diffrax.AbstractTerm]:
-    """The terms of which the user has not asserted the structure."""
-    return [term for term in terms if asserted_structure(term) != structure]
-
-
 def _wrong_assertion(
     structure: AssertedStructure,
     drift: Terms,
@@ -416,12 +337,12 @@ def _wrong_assertion(
     """The fault of the first term that the user asserted to have this structure, and that
     does not have it at `y0`; `None` if there is none, or if values are traced. For
     "additive" pass no drift: only noise can break it."""
-
-    def fault_of(term: diffrax.AbstractTerm, is_noise: bool) -> Fault | None:
+    for i, term in enumerate((*drift, *noise)):
+        is_noise = i >= len(drift)
         if asserted_structure(term) != structure:
-            return None
+            continue
         if not contradicts_assertion(term, structure, is_noise, t0, y0, args):
-            return None
+            continue
         if structure == "additive":
             cause = "at or near `y0` the noise depends on the state"
         elif is_noise:
@@ -433,13 +354,6 @@ def _wrong_assertion(
             f"`{name_of_maker(term)}`, and {_GENERAL}."
         )
         return Fault(cause, advice)
-
-    for term in drift:
-        if fault := fault_of(term, is_noise=False):
-            return fault
-    for term in noise:
-        if fault := fault_of(term, is_noise=True):
-            return fault
     return None
 
 

@@ -39,10 +39,16 @@ def noises_commute(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
         _, Db_x_b_z = jax.jvp(b_x, (y,), (b_z(y),))
         return largest_entry(Db_z_b_x), largest_entry((Db_z_b_x**ω - Db_x_b_z**ω).ω)
 
+    # Four with entries of either sign, and four with entries between 0 and 1, where most
+    # functions are defined.
+    shape = (4, zeros.size)
+    of_either_sign = jr.normal(jr.key(0), shape, zeros.dtype)
+    positive = jr.uniform(jr.key(0), shape, zeros.dtype)
+    points = jnp.concatenate([of_either_sign, positive])
     try:
         with jax.disable_jit(False):
             # For each point the size of a summand of the bracket, and of the bracket.
-            of_summand, of_bracket = sizes(_random_points(zeros))
+            of_summand, of_bracket = sizes(points)
             # Points at which these are not finite tell nothing; one other has to remain.
             is_finite = jnp.isfinite(of_summand) & jnp.isfinite(of_bracket)
             # A bracket that cancels leaves rounding errors of its summands.
@@ -56,12 +62,3 @@ def noises_commute(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
         return False
     # Inside `jax.jit` the result is not known.
     return not is_traced(commute) and bool(commute)
-
-
-def _random_points(like: Float[Array, " n"]) -> Float[Array, "8 n"]:
-    """Four vectors in the shape of `like` with entries of either sign, and four with
-    entries between 0 and 1, where most functions are defined."""
-    shape = (4, *like.shape)
-    of_either_sign = jr.normal(jr.key(0), shape, like.dtype)
-    positive = jr.uniform(jr.key(0), shape, like.dtype)
-    return jnp.concatenate([of_either_sign, positive])

@@ -15,22 +15,28 @@ from ..._programs import Traced
 from ..drift_and_noise import flattened
 from ..langevin import BathNoise
 from ..paths import brownian_paths
-from ..symplectic_gradients import drift_hamiltonians, Hamiltonian
+from ..symplectic_gradients import Drift, hamiltonian_parts
 
 
 def check_drifts_differ(terms: PyTree[diffrax.AbstractTerm]) -> None:
     """Raises a `ValueError` if two drifts have the same Hamiltonian, which would count
     twice."""
-    earlier: list[Hamiltonian] = []
-    for H0 in drift_hamiltonians(terms):
+    earlier: list[Any] = []
+    for part in hamiltonian_parts(terms):
+        H0 = part.H0 if isinstance(part, Drift) else None
+        # A drift may be a slow potential alone.
+        if H0 is None:
+            continue
         # Two functions may compute the same, and programs do not tell which they were.
         if any(map(_is_program, jtu.tree_leaves(H0, is_leaf=_is_program))):
             continue
         # The result is not `True` but traced for Modules with traced parameters, which may
         # be equal or not.
         if any(eqx.tree_equal(H0, other) is True for other in earlier):
+            # The name of a function, or of the class of a Module.
+            name = getattr(H0, "__name__", type(H0).__name__)
             raise ValueError(
-                f"`H0` stands in two drift terms ({_function_name(H0)}), so it would count "
+                f"`H0` stands in two drift terms ({name}), so it would count "
                 "twice. Make one drift of it, by `hamiltonian_terms` or `langevin_terms`, "
                 "and add noise alone by `noise_terms(noise, path)`, or a second bath by "
                 "`bath_terms(H0, friction, temperature, path)`: "
@@ -41,11 +47,6 @@ def check_drifts_differ(terms: PyTree[diffrax.AbstractTerm]) -> None:
 
 def _is_program(x: Any) -> bool:
     return isinstance(x, Traced)
-
-
-def _function_name(H0: Hamiltonian) -> str:
-    """The name of a function, or of the class of a Module."""
-    return getattr(H0, "__name__", type(H0).__name__)
 
 
 def check_baths_have_own_noise(terms: PyTree[diffrax.AbstractTerm]) -> None:
@@ -71,5 +72,4 @@ def _known_keys(term: diffrax.AbstractTerm) -> set[bytes]:
     """The random keys of the paths of a term that are not traced, each as its words."""
     keys = filter(is_key, jtu.tree_leaves(brownian_paths(term)))
     words_of_each = [jr.key_data(typed_key(key)) for key in keys]
-    known = [words for words in words_of_each if not is_traced(words)]
-    return {np.asarray(words).tobytes() for words in known}
+    return {np.asarray(x).tobytes() for x in words_of_each if not is_traced(x)}
