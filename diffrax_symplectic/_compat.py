@@ -202,19 +202,19 @@ class OperandPlace(NamedTuple):
 
 
 def with_constants_at(jaxpr: Jaxpr, places: Sequence[OperandPlace]) -> Jaxpr:
-    """A program that reads new constants in these places, in place of what it reads there.
-    They come after the constants that it has."""
+    """The program that reads a new constant in each of these places. The new constants come
+    after those that it has."""
     operands: list[list[Any]] = [list(eqn.invars) for eqn in jaxpr.eqns]
     operands.append(list(jaxpr.outvars))
     avals = [operands[place.operation][place.position].aval for place in places]
     structs = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
-    # Each version of JAX constructs variables from other arguments. So JAX makes them here:
-    # they are the inputs of a trace.
+    # The constructor of a variable differs between versions of JAX. So JAX makes them: they
+    # are the inputs of a trace of the identity.
     new_constants = jax.make_jaxpr(lambda *xs: xs)(*structs).jaxpr.invars
     for place, constant in zip(places, new_constants):
         operands[place.operation][place.position] = constant
-    *of_operations, results = operands
-    eqns = [eqn.replace(invars=xs) for eqn, xs in zip(jaxpr.eqns, of_operations)]
+    *operands_of_eqns, results = operands
+    eqns = [eqn.replace(invars=xs) for eqn, xs in zip(jaxpr.eqns, operands_of_eqns)]
     constants = [*jaxpr.constvars, *new_constants]
     return jaxpr.replace(eqns=eqns, outvars=results, constvars=constants)
 
@@ -388,9 +388,9 @@ class StepTimes(NamedTuple):
         _, *other_state = self.init_state.controller_state
         initial_time = self.init_state.tprev
         time_after_first_step = self.init_state.tnext
-        # The controller is asked for the step after `i - 1` steps. It computes the end of
-        # that step from the number of steps, which its state begins with. The start, for
-        # which it takes `t1`, is not used.
+        # A constant step size is asked for the next step after `i - 1` steps, the number
+        # that its state begins with. It answers with the start and the end of that step,
+        # and more. The start is the `t1` that it is given, and is not used.
         _, _, time_after_step, *_ = self.controller.adapt_step_size(
             t0=initial_time,
             t1=time_after_first_step,
@@ -401,8 +401,8 @@ class StepTimes(NamedTuple):
             error_order=1,
             controller_state=(i - 1, *other_state),
         )
-        # The first step of the controller ends at `t0 + dt0`, all later ones at fractions
-        # of the interval: these differ by rounding.
+        # In Diffrax the first step ends at `t0 + dt0`, and all later ones at fractions of
+        # the interval, which differ by rounding. Both are followed here.
         return jnp.where(i == 1, time_after_first_step, time_after_step)
 
     def solver_state(self) -> Any:

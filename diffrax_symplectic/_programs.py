@@ -269,10 +269,10 @@ def _interned(program: _Program, identity: Any) -> _Program:
 
 def _description(jaxpr: Jaxpr, only_named: list[Any]) -> Hashable:
     """All that a program computes: equal for equal programs, since variables are numbered
-    as they appear. Appends to `only_named` what a trace names, but does not write out, such
-    as callbacks."""
+    as they appear. What a trace names, but does not write out, such as callbacks, is
+    appended to `only_named`."""
     number_of: dict[Any, int] = {}
-    # Most operations have the same context, whose text is long.
+    # By identity, since most operations share one context, whose text is long.
     contexts: dict[int, str] = {}
 
     def variable(x: Any) -> Hashable:

@@ -264,15 +264,15 @@ def normal_from_words(words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]
     """The inverse of the normal distribution function, at the middle of each word's
     interval of length `2^-32`."""
     half = np.asarray(0.5, dtype)
-    unit = np.asarray(2.0**-31, dtype)
+    two_intervals = np.asarray(2.0**-31, dtype)
     # Processors convert signed integers to floats faster than unsigned ones.
     signed = lax.bitcast_convert_type(words ^ np.uint32(2**31), np.int32)
-    # With p and q as above, 2 q with its sign, which is accurate where q is near zero; and
-    # 2 p, which is accurate in the tails, where p is near zero. Half a unit more is the
-    # middle of the interval.
-    two_q = (signed.astype(dtype) + half) * unit
+    # With p and q as for `_NUMERATOR`, 2 q with its sign, which is accurate where q is near
+    # zero; and 2 p, which is accurate in the tails, where p is near zero. Half an interval
+    # more is the middle of it.
+    two_q = (signed.astype(dtype) + half) * two_intervals
     tail = lax.bitcast_convert_type(jnp.minimum(words, ~words), np.int32)
-    two_p = (tail.astype(dtype) + half) * unit
+    two_p = (tail.astype(dtype) + half) * two_intervals
     argument = -jnp.log(two_p * (2 - two_p))
     product = two_q * half * _polynomial(_NUMERATOR, argument)
     return product / _polynomial(_DENOMINATOR, argument)

@@ -59,14 +59,15 @@ class NewtonCorrection(NamedTuple):
 
 
 def correction(fn: _Map, x: _Vector, solver: LinearSolver) -> NewtonCorrection:
-    """The Newton correction for `fn(x) = 0` at `x`."""
+    """The Newton correction for `fn(x) = 0` at `x`. Without a `solver`, small systems are
+    solved by elimination."""
     if solver is not None or x.size > _MAX_DENSE:
         value, derivative = jax.linearize(fn, x)
         change, found = solve(derivative, value, solver)
         return NewtonCorrection(value, change, found, derivative)
 
-    # The columns of the Jacobian are the derivatives along unit vectors. With `jvp` the
-    # compiled program contains `fn` only once.
+    # The columns of the Jacobian are the derivatives along unit vectors. `jvp` gives value
+    # and column by one evaluation, so that the compiled program contains `fn` once.
     def value_and_column(unit: _Vector) -> tuple[_Vector, _Vector]:
         return jax.jvp(fn, (x,), (unit,))
 

@@ -54,15 +54,15 @@ class Layout(NamedTuple):
         PyTree, such as `t=2, ['energy'][0]`. Without `ts` the number of the time comes
         first in the brackets. A single number has an empty label."""
         tree = self.treedef.unflatten([np.zeros(shape) for shape in self.shapes])
+        is_time_an_index = ts is None and self.num_times is not None
         labels = []
         for k in range(1 if self.num_times is None else self.num_times):
-            for path, leaf in jtu.tree_leaves_with_path(tree):
+            time = "" if ts is None else f"t={ts[k]:.7g}"
+            for keys, leaf in jtu.tree_leaves_with_path(tree):
                 for index in np.ndindex(leaf.shape):
-                    time = "" if ts is None else f"t={ts[k]:.7g}"
-                    is_time_index_needed = ts is None and self.num_times is not None
-                    indices = (k, *index) if is_time_index_needed else index
+                    indices = (k, *index) if is_time_an_index else index
                     entry = f"[{', '.join(map(str, indices))}]" if indices else ""
-                    place = jtu.keystr(path) + entry
+                    place = jtu.keystr(keys) + entry
                     labels.append(", ".join(filter(None, (time, place))))
         return labels
 

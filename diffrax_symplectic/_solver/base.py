@@ -106,11 +106,11 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
         if self.record is None:
             return None
         # The terms are looked at only if it matters: for most solvers they may be `None`.
+        depends_on_commuting = isinstance(getattr(self.record, want), tuple)
         # One noise commutes with itself, and without noise there is nothing to commute.
         # Whether several commute depends on values, which are not known here, so the lower
         # order is returned.
-        is_one_order = not isinstance(getattr(self.record, want), tuple)
-        commute = is_one_order or number_of_noises(terms) <= 1
+        commute = not depends_on_commuting or number_of_noises(terms) <= 1
         return self.record.order(want, commute)
 
     def path(

@@ -124,9 +124,11 @@ def linear_flow(
 def _modes_of(
     stiffness: ArrayLike, mass_roots: Float[Array, "..."]
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """The frequencies of the modes, the roots of the eigenvalues of `M^-1/2 K M^-1/2`; and
-    its eigenvectors as columns, the modes of the scaled positions `M^1/2 q`.
+    """The modes of a stiffness `K`, from the matrix `A = M^-1/2 K M^-1/2`, where
+    `mass_roots` is `M^1/2`, one number or in the shape of `q`.
 
+    Returns the frequencies, which are the roots of the eigenvalues of `A`; and the
+    eigenvectors of `A` as columns, which are the modes of the scaled positions `M^1/2 q`.
     They are computed by NumPy if all values are known, so that wrong ones raise a
     `ValueError`.
     """
@@ -140,6 +142,7 @@ def _modes_of(
     n = math.prod(shape_of_q)
     K = K.reshape(n, n)
     is_known = not is_traced(K) and not is_traced(mass_roots)
+    # Both have `eigh`, `where` and so on by the same names.
     xp: Any = np if is_known else jnp
     if is_known:
         largest_entry = np.max(abs(K), initial=0)
@@ -147,9 +150,12 @@ def _modes_of(
             raise ValueError(
                 "`stiffness` must be symmetric: it is a second derivative."
             )
-    root_of_each = xp.broadcast_to(xp.asarray(mass_roots), shape_of_q).reshape(-1)
+    # Those of all components of `q`.
+    mass_roots_of_q = xp.broadcast_to(xp.asarray(mass_roots), shape_of_q).reshape(-1)
     # The eigenvalues are the squares of the frequencies.
-    eigenvalues, vectors = xp.linalg.eigh(K / root_of_each[:, None] / root_of_each)
+    eigenvalues, vectors = xp.linalg.eigh(
+        K / mass_roots_of_q[:, None] / mass_roots_of_q
+    )
     rounding = _TOLERANCE * xp.max(abs(eigenvalues), initial=0)
     least = xp.min(eigenvalues, initial=0)
     if is_known and least < -rounding:

@@ -174,28 +174,33 @@ _LAPACK: dict[str, Callable[..., list[list[Any]]]] = {
 
 @rule
 def _custom_call(operation: Operation, *xs: Tensor) -> list[Tensor]:
+    """A call of LAPACK, for which operations on entries stand in. All axes but the last two
+    are a batch of matrices."""
     target = call_target(operation.mlir_op)
     # By this call, older versions of JAX say on which devices an array is.
     if target == "Sharding":
         return list(xs)
     # The first letter of LAPACK's name says the precision, single or double.
-    name = re.fullmatch("lapack_[sd](.*)_ffi", target)
-    if name is None or name[1] not in _LAPACK:
+    match = re.fullmatch("lapack_[sd](.*)_ffi", target)
+    if match is None or match[1] not in _LAPACK:
         raise NotReplayed(operation.mlir_op, f"a call of `{target}`")
     batches = []
     for x in xs:
-        # `inv` has as many right-hand sides as unknowns.
+        # The larger side, since right-hand sides may be many, too: `inv` has as many as
+        # unknowns.
         if max(x.shape[-2:]) > _MOST_UNKNOWNS:
             what = f"`{target}` with more than {_MOST_UNKNOWNS} unknowns"
             raise NotReplayed(operation.mlir_op, what)
-        # The last two axes are those of the matrices.
         places = x.places.reshape(math.prod(x.shape[:-2]), *x.shape[-2:])
         batches.append([[x.take(row).entries for row in matrix] for matrix in places])
+    # For each matrix of the batch, the entries of each array that LAPACK returns.
     results = [
-        _LAPACK[name[1]](operation, *matrices)
+        _LAPACK[match[1]](operation, *matrices)
         for matrices in zip(*batches, strict=True)
     ]
+    # For each array, the entries of all matrices.
+    arrays = zip(*results)
     return [
-        Tensor(_entries([*of_batch]), shape)
-        for of_batch, shape in zip(zip(*results), operation.shapes)
+        Tensor(_entries(list(entries)), shape)
+        for entries, shape in zip(arrays, operation.shapes)
     ]

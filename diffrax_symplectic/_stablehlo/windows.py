@@ -96,8 +96,10 @@ def _window_at(
 ) -> Tensor:
     """The window of `x` that begins at `starts`, moved into `x` if it is not within. Both
     `starts` and `sizes` have an element for each axis."""
-    is_known = all(known_value(start) is not None for start in starts)
-    if isinstance(x.entries, Table) and not is_known:
+    # Memory is read at an address that each path computes. Entries in registers have none:
+    # the window is selected among all places where it may be.
+    is_same_for_all_paths = all(known_value(start) is not None for start in starts)
+    if isinstance(x.entries, Table) and not is_same_for_all_paths:
         return _window_of_table(operation, x, x.entries, starts, sizes)
     windows = _possible_windows(operation, x, starts, sizes)
     return _selected((mask, x.take(x.places[slices])) for slices, mask in windows)

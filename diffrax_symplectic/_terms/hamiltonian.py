@@ -13,9 +13,9 @@ from .paths import as_path
 from .symplectic_gradients import (
     AssertedStructure,
     Drift,
+    HalfState,
     Hamiltonian,
     HamiltonianNoise,
-    Momenta,
 )
 
 
@@ -26,7 +26,7 @@ def hamiltonian_terms(
     *,
     structure: AssertedStructure | None = None,
     constraint: Constraint | None = None,
-    slow: Callable[[RealScalarLike, Momenta, Args], Array] | None = None,
+    slow: Callable[[RealScalarLike, HalfState, Args], Array] | None = None,
 ) -> diffrax.MultiTerm:
     r"""The terms of a stochastic Hamiltonian system, from its Hamiltonians.
 

@@ -31,9 +31,9 @@ else:
 
 
 # Momenta or positions, which have the same structure and shapes.
-Momenta = PyTree[Shaped[Array, "?*p"], "P"]
-_State = tuple[Momenta, Momenta]
-Hamiltonian = Callable[[RealScalarLike, Momenta, Momenta, Args], PyTree[Array]]
+HalfState = PyTree[Shaped[Array, "?*p"], "P"]
+_State = tuple[HalfState, HalfState]
+Hamiltonian = Callable[[RealScalarLike, HalfState, HalfState, Args], PyTree[Array]]
 AssertedStructure = Literal["separable", "additive"]
 
 
@@ -100,13 +100,13 @@ class AbstractFriction(AbstractCaller):
     """A vector field `(-G v, 0)` with the velocities `v`."""
 
     @abc.abstractmethod
-    def velocity(self, t: RealScalarLike, y: _State, args: Args) -> Momenta:
+    def velocity(self, t: RealScalarLike, y: _State, args: Args) -> HalfState:
         """The velocities `v` of the state `y = (p, q)`."""
 
     @abc.abstractmethod
     def force(
-        self, t: RealScalarLike, q: Momenta, args: Args, velocity: Momenta
-    ) -> Momenta:
+        self, t: RealScalarLike, q: HalfState, args: Args, velocity: HalfState
+    ) -> HalfState:
         """`-G v` at the positions `q`, for `v = velocity`."""
 
     def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
@@ -138,7 +138,7 @@ class Drift(AbstractCaller):
     def __call__(self, t: RealScalarLike, y: _State, args: Args) -> _State:
         check_pair(y)
 
-        def energy(p: Momenta, q: Momenta) -> Array:
+        def energy(p: HalfState, q: HalfState) -> Array:
             energies = []
             if self.H0 is not None:
                 energies.append(checked_energy("H0", self.H0, t, p, q, args=args))
@@ -201,7 +201,7 @@ class HamiltonianNoise(AbstractNoise):
             # its increment an array of one number, or the other way round.
             return jnp.shape(H) == struct.shape or jnp.size(H) == struct.size == 1
 
-        def hamiltonians(p: Momenta, q: Momenta) -> PyTree[Array]:
+        def hamiltonians(p: HalfState, q: HalfState) -> PyTree[Array]:
             """The noise Hamiltonians, in the structure and shapes of the path."""
             if isinstance(self.noise, IndexedNoise):
                 # An `IndexedNoise` gives advice on the errors of its function by itself.
@@ -232,7 +232,7 @@ class HamiltonianNoise(AbstractNoise):
             return jnp.sum(H * increment.astype(H.dtype))
 
         # The noise of a step is the gradient of one scalar, for any number of noises.
-        def energy(p: Momenta, q: Momenta) -> Any:
+        def energy(p: HalfState, q: HalfState) -> Any:
             if not isinstance(control, OneNoise):
                 dots = jtu.tree_map(dot, hamiltonians(p, q), control)
                 return sum(jtu.tree_leaves(dots))

@@ -40,7 +40,9 @@ def apply_one(
     """The vector field of one noise times its increment. `index` is that of the noise among
     the noises of all terms, in the order of their flattened controls."""
 
-    def product(term: diffrax.AbstractTerm, struct: PyTree, k: Any, w: Array) -> Y:
+    def product(
+        term: diffrax.AbstractTerm, struct: PyTree, k: IntScalarLike, w: Array
+    ) -> Y:
         """The vector field of noise `k` of this term times its increment `w`. Where
         possible no other noise is evaluated or multiplied."""
         # Only the kind is read from the user's term. The term itself is called, which keeps
@@ -49,10 +51,13 @@ def apply_one(
             return term.vf_prod(t, y, args, OneNoise(k, w))
         if isinstance(unwrapped(term), diffrax.ControlTerm):
             field = term.vf(t, y, args)
-            # Lineax operators and other PyTrees cannot be indexed by the noise.
-            is_array = eqx.is_array(field) and isinstance(struct, jax.ShapeDtypeStruct)
+            # Only an array, for noises in one array, can be indexed by the noise: no
+            # operator of Lineax and no other PyTree.
+            are_arrays = eqx.is_array(field) and isinstance(
+                struct, jax.ShapeDtypeStruct
+            )
             # A scalar noise has no axis of noises to index.
-            if is_array and field.ndim > 0 and field.shape[-1:] == struct.shape:
+            if are_arrays and field.ndim > 0 and field.shape[-1:] == struct.shape:
                 return field[..., k] * w.astype(field.dtype)
         # Everything else adds up all noises, so all increments but this one are zero.
         zeros, unravel = zeros_and_unravel(struct)

@@ -165,18 +165,19 @@ def discretization_error(
     error = np.abs(mean[Combination.EXTRAPOLATION])
     if levels == 2:
         return error, None
-    # With this change alone, 5 to 12% of the means of harmonic oscillators over long times,
-    # by four and five levels, were more than two error bars off. With both it is 0 to 2%.
-    # The other one is the change if the last extrapolation eliminated the first power of
-    # the step size only.
+    # The error is the larger of two changes by the coarsest level: by the extrapolation
+    # itself (`EXTRAPOLATION`), and by one whose last step eliminates the first power of the
+    # step size only (`BY_FIRST_POWER`). With the first alone, 5 to 12% of the means of
+    # harmonic oscillators over long times, by four and five levels, were more than two
+    # error bars off. With both it is 0 to 2%.
     by_first_power = np.abs(mean[Combination.BY_FIRST_POWER])
     noise = _STD_ERRORS_BY_CHANCE * results.std_error[Combination.BY_FIRST_POWER]
     error = np.maximum(error, by_first_power - noise)
+    # `MISS` is `LAST` minus what the order predicts from `BEFORE`.
     last_change = mean[Combination.LAST]
-    # What the order foretells from the change before.
     prediction = last_change - mean[Combination.MISS]
-    # The ends of the range of changes that fit. The second is the lower one where the
-    # prediction is negative.
+    # The ends of the range of changes that fit the order. The second is the lower one where
+    # the prediction is negative.
     ends = np.stack([_LEAST_RATIO * prediction, _LARGEST_RATIO * prediction])
     allowance = _STD_ERRORS_BY_CHANCE * results.std_error[Combination.MISS]
     is_less = last_change < np.min(ends, axis=0) - allowance

@@ -93,8 +93,8 @@ def least_squares(
     is_in_block = is_used[:, :, None] & is_used[:, None]
     factors = jnp.where(is_in_block, L, jnp.eye(num_columns, dtype=L.dtype))
 
-    def solution(L, rhs):
-        return jax.scipy.linalg.cho_solve((L, True), rhs)
+    def solution(factor, rhs):
+        return jax.scipy.linalg.cho_solve((factor, True), rhs)
 
     def refine(_, c: Float[Array, "fits P m"]) -> Float[Array, "fits P m"]:
         # (fits, n, m)

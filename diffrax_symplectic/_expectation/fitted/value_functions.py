@@ -129,35 +129,42 @@ class ValueFunctions(AbstractSampling):
 
         # A trial, whose paths are not part of the estimate.
         always_used = np.ones(problem.output_shape, bool)
-        plan = plan_for(always_used, mixture, self.batch_size)
-        trial = run(plan, jr.fold_in(key, _TRIAL_KEY), devices)
+        trial_plan = plan_for(always_used, mixture, self.batch_size)
+        trial = run(trial_plan, jr.fold_in(key, _TRIAL_KEY), devices)
         is_used, remainder = _comparison(trial, problem)
         if self.degree == 0:
-            is_used = ~always_used
-        if self.degree and not np.any(is_used):
+            # No control variate was asked for.
+            is_used = np.zeros(problem.output_shape, bool)
+        elif self.degree is not None and not np.any(is_used):
             warnings.warn(
                 f"`degree={self.degree}` is no better than no control variate, so none is "
                 "used. Pass another `degree`, or another `sampling`.",
                 stacklevel=_FRAMES_TO_USER,
             )
-        # If paths fail, those of the other laws, which go further out, fail far more often,
-        # and show nothing of the rare paths for which they are there.
+        # The mixture draws some paths by wider laws than the own one of the noise. If paths
+        # of the trial fail, such paths fail far more often, and show nothing of the rare
+        # paths for which they are there.
         if trial.num_failed > 0 or not np.any(is_used):
             mixture = mixture.own_law_alone()
         plan = plan_for(is_used, mixture, self.num_paths)
-        # Zero stands for no control variate.
-        used = np.unique(np.where(is_used, basis.resolution, 0))
-        options = np.unique([0, basis.resolution])
         return plan._replace(
-            reason=(
-                f"{basis.resolution_name}: {', '.join(map(str, used))}, chosen among "
-                f"{', '.join(map(str, options))}"
-            ),
+            reason=_choice_in_words(basis, is_used),
             remainder=remainder,
             with_halved_steps=(
                 ft.partial(_with_halved_steps, plan, key) if chosen.is_quick else None
             ),
         )
+
+
+def _choice_in_words(basis: AbstractBasis, is_used: Bool[np.ndarray, "S m"]) -> str:
+    """The degree or the number of grid points, and whether all means use it, for the
+    result. Zero stands for no control variate."""
+    used = np.unique(np.where(is_used, basis.resolution, 0))
+    options = np.unique([0, basis.resolution])
+    return (
+        f"{basis.resolution_name}: {', '.join(map(str, used))}, chosen among "
+        f"{', '.join(map(str, options))}"
+    )
 
 
 def _with_halved_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:

@@ -49,9 +49,10 @@ def check_start(
 
     Returns two flags: whether the constraints are dependent at `y0`, and whether `y0` is
     off them. A flag that is true raises a `ValueError` if it is known, and otherwise an
-    error when run, except in a batch: there the caller makes its path fail."""
+    error when run, except under `vmap`: there the caller makes its path fail."""
     _check_constant_masses(terms, t0, y0, args)
-    # Flags have no derivative, which `grad` would trace all the same.
+    # Flags have no derivative. Without this, `grad` would differentiate the checks all the
+    # same.
     fixed_y0, fixed_args = jtu.tree_map(
         lambda x: lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, (y0, args)
     )

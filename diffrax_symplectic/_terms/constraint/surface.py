@@ -163,8 +163,7 @@ class Surface(NamedTuple):
 
     def is_dependent(self, normal_space: NormalSpace) -> Bool[Array, ""]:
         """Whether the normals are linearly dependent, up to rounding errors."""
-        # In a solve backward in time velocities, and with them the matrix, change their
-        # sign.
+        # Backward in time, velocities change their sign, and with them the Gram matrix.
         gram = normal_space.gram * jnp.sign(jnp.trace(normal_space.gram))
         lengths = jnp.sqrt(jnp.diag(gram))
         # The cosines of the angles between normals. The pivots of their Cholesky factor are
@@ -172,7 +171,8 @@ class Surface(NamedTuple):
         cosines = gram / lengths / lengths[:, None]
         pivots = jnp.diag(jnp.linalg.cholesky(cosines)) ** 2
         rounding = 1000 * jnp.finfo(gram.dtype).eps
-        # NaN, of a normal that is zero or a factor that does not exist, is not greater.
+        # `>` is false for NaN, which comes from a normal that is zero, or where there is no
+        # Cholesky factor.
         return ~jnp.all(pivots > rounding)
 
     def is_off(self, p: Vector, normal_space: NormalSpace) -> Bool[Array, ""]:

@@ -19,17 +19,17 @@ from ..callers import AbstractCaller
 from ..evaluation import call_user_function
 
 
-# Momenta, velocities or positions: one array, or a PyTree of arrays.
-_Momenta = PyTree[Array]
+# Momenta, velocities or positions: an array, or a PyTree of arrays.
+_HalfState = PyTree[Array]
 # A temperature, constant or a function.
 Value = (
-    PyTree[ArrayLike] | Callable[[RealScalarLike, _Momenta, Args], PyTree[ArrayLike]]
+    PyTree[ArrayLike] | Callable[[RealScalarLike, _HalfState, Args], PyTree[ArrayLike]]
 )
 # A friction, constant or a function, except for directions.
 FrictionValue = (
     Value
     | lx.AbstractLinearOperator
-    | Callable[[RealScalarLike, _Momenta, Args], lx.AbstractLinearOperator]
+    | Callable[[RealScalarLike, _HalfState, Args], lx.AbstractLinearOperator]
 )
 
 _EXPECTED = "a real number, an array or PyTree of them, or a function of `(t, q, args)`"
@@ -78,7 +78,7 @@ class _Matrix(eqx.Module):
     structure: PyTree[jax.ShapeDtypeStruct] = eqx.field(static=True)
 
 
-def value_at(name: str, value: Any, t, q: _Momenta, args: Args) -> Any:
+def value_at(name: str, value: Any, t, q: _HalfState, args: Args) -> Any:
     """The user's friction, temperature or directions, called `name` in messages: a
     constant, or the value of a function."""
     if not callable(value):
@@ -87,8 +87,8 @@ def value_at(name: str, value: Any, t, q: _Momenta, args: Args) -> Any:
 
 
 def product_with(
-    friction: Any, t, q: _Momenta, args: Args, velocity: _Momenta
-) -> _Momenta:
+    friction: Any, t, q: _HalfState, args: Args, velocity: _HalfState
+) -> _HalfState:
     """`G v` for the user's `friction` G in any of its forms. NaN where numbers are
     negative, or a constant matrix is not semidefinite."""
     if isinstance(friction, FrictionAlong):
@@ -114,8 +114,8 @@ def product_with(
 
 
 def root_product_with(
-    friction: Any, T: PyTree, t, q: _Momenta, args: Args, control: BM
-) -> _Momenta:
+    friction: Any, T: PyTree, t, q: _HalfState, args: Args, control: BM
+) -> _HalfState:
     """`B W` for the increments `W = control`, with `B B^T = 2 T G`. Raises a `ValueError`
     if their shapes do not fit the friction or the momenta."""
     if isinstance(friction, FrictionAlong):
@@ -200,7 +200,9 @@ def _checked_matrix(
     return friction.matrix if isinstance(friction, _Matrix) else friction.as_matrix()
 
 
-def _checked_columns(friction: FrictionAlong, t, q: _Momenta, args: Args) -> _Momenta:
+def _checked_columns(
+    friction: FrictionAlong, t, q: _HalfState, args: Args
+) -> _HalfState:
     """The directions for each array of the momenta, with a trailing axis of noises. Raises
     a `ValueError` if their shapes do not fit the momenta."""
     columns = value_at("directions", friction.directions, t, q, args)
@@ -313,20 +315,20 @@ def checked_friction(
 ) -> Any:
     """The friction, with the root of a constant matrix, for a path with increments like
     `path_struct`, or without a path. Raises a `ValueError` if it is known to be invalid."""
-    # The momenta are not known before the solve, and if their shape is another than the
-    # path's, either may be wrong: messages name both.
-    called = "the `path` and the momenta"
+    # Before the solve only the shape of the path is known. If the friction does not fit it,
+    # the path or the friction may be wrong, so messages name what both have to fit.
+    what_it_fits = "the `path` and the momenta"
     if isinstance(friction, FrictionAlong):
         if not callable(friction.directions):
             return jtu.tree_map(jnp.asarray, friction)
         check_takes("directions", friction.directions, "t", "q", "args")
         return friction
     if isinstance(friction, lx.AbstractLinearOperator):
-        # Without a path the shapes of the momenta are known in the solve only. Here any
-        # fit.
+        # Without a path the operator is compared with its own structure here, and with the
+        # momenta in the solve.
         structure = friction.in_structure()
         momenta = structure if path_struct is None else path_struct
-        matrix = _checked_matrix(friction, momenta, called)
+        matrix = _checked_matrix(friction, momenta, what_it_fits)
         # The root of any other matrix than a semidefinite one is NaN.
         root = _root_of_matrix(matrix)
         is_semidefinite = ~jnp.any(jnp.isnan(root))
@@ -346,7 +348,7 @@ def checked_friction(
             f"{friction!r}."
         )
     if path_struct is not None:
-        _checked_numbers("friction", friction, path_struct, called)
+        _checked_numbers("friction", friction, path_struct, what_it_fits)
     return _checked_arrays("friction", friction)
 
 

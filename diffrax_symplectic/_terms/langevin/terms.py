@@ -18,7 +18,11 @@ from ..constrained_drift import Constraint, with_constraint
 from ..evaluation import checked_energy
 from ..hamiltonian import hamiltonian_terms
 from ..paths import as_path
-from ..symplectic_gradients import AbstractFriction, AbstractNoise
+from ..symplectic_gradients import (
+    AbstractFriction,
+    AbstractNoise,
+    AssertedStructure,
+)
 from .friction import (
     checked_friction,
     checked_temperature,
@@ -31,9 +35,9 @@ from .friction import (
 )
 
 
-# Momenta, velocities or positions: one array, or a PyTree of arrays.
-_Momenta = PyTree[Array]
-_Hamiltonian = Callable[[RealScalarLike, _Momenta, _Momenta, Args], PyTree[Array]]
+# Momenta, velocities or positions: an array, or a PyTree of arrays.
+_HalfState = PyTree[Array]
+_Hamiltonian = Callable[[RealScalarLike, _HalfState, _HalfState, Args], PyTree[Array]]
 
 
 def langevin_terms(
@@ -42,9 +46,9 @@ def langevin_terms(
     temperature: Value | None = None,
     path: diffrax.AbstractBrownianPath | PyTree | None = None,
     *,
-    structure: Any = None,
+    structure: AssertedStructure | None = None,
     constraint: Constraint | None = None,
-    slow: Callable[[RealScalarLike, _Momenta, Args], Array] | None = None,
+    slow: Callable[[RealScalarLike, _HalfState, Args], Array] | None = None,
 ) -> diffrax.MultiTerm:
     r"""The terms of Langevin dynamics: a Hamiltonian system in a heat bath. Solve with
     [`diffrax_symplectic.BAOAB`][] unless masses depend on positions, then with
@@ -177,7 +181,7 @@ class Friction(AbstractFriction):
     def velocity(self, t, y, args):
         p, q = y
 
-        def energy(p: _Momenta) -> Array:
+        def energy(p: _HalfState) -> Array:
             return checked_energy("H0", self.H0, t, p, q, args=args)
 
         return jax.grad(energy)(p)
@@ -198,8 +202,12 @@ class BathNoise(AbstractNoise):
         return {"friction": (t, q, args), "temperature": (t, q, args)}
 
     def vf_prod(
-        self, t: RealScalarLike, y: tuple[_Momenta, _Momenta], args: Args, control: BM
-    ) -> tuple[_Momenta, _Momenta]:
+        self,
+        t: RealScalarLike,
+        y: tuple[_HalfState, _HalfState],
+        args: Args,
+        control: BM,
+    ) -> tuple[_HalfState, _HalfState]:
         check_pair(y)
         _, q = y
         T = value_at("temperature", self.temperature, t, q, args)

@@ -27,7 +27,8 @@ def check_drifts_differ(terms: PyTree[diffrax.AbstractTerm]) -> None:
         # A drift may be a slow potential alone.
         if H0 is None:
             continue
-        # Two functions may compute the same, and programs do not tell which they were.
+        # Functions that were traced already are compared by what they compute, which two
+        # different functions may have in common. So they are not compared here.
         if any(map(_is_program, jtu.tree_leaves(H0, is_leaf=_is_program))):
             continue
         # The result is not `True` but traced for Modules with traced parameters, which may
