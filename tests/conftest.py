@@ -54,9 +54,9 @@ def _mappings() -> float:
 @pytest.fixture(autouse=True, scope="module")
 def free_compiled_programs():
     """Thousands of programs in one process exhaust its memory mappings, and XLA crashes.
-    Until half of these are used they are kept: many small ones occur in every file, and to
-    free them takes seconds."""
+    Until a quarter of these are used they are kept: many small ones occur in every file, and
+    to free them takes seconds."""
     yield
-    if _mappings() > 30_000:
+    if _mappings() > 16_000:
         jax.clear_caches()
         gc.collect()
