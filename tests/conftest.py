@@ -54,7 +54,7 @@ def _mappings() -> float:
 @pytest.fixture(autouse=True, scope="module")
 def free_compiled_programs():
     """Thousands of programs in one process exhaust its memory mappings, and XLA crashes.
-    Until a quarter of these are used they are kept: many small ones occur in every file, and
+    They are kept until a quarter of these are used: many small ones occur in every file, and
     to free them takes seconds."""
     yield
     if _mappings() > 16_000:
