@@ -54,8 +54,8 @@ def _mappings() -> float:
 @pytest.fixture(autouse=True, scope="module")
 def free_compiled_programs():
     """Thousands of programs in one process exhaust its memory mappings, and XLA crashes.
-    They are kept until a quarter of these are used: many small ones occur in every file, and
-    to free them takes seconds."""
+    They are kept until a quarter of these are used: many small ones occur in every file,
+    and to free them takes seconds."""
     yield
     if _mappings() > 16_000:
         jax.clear_caches()
