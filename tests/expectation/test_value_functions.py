@@ -275,10 +275,10 @@ def test_the_weights_of_a_mixture_have_mean_one_and_are_those_of_all_laws():
             return log_ratios_of_outcomes(mixture.log_ratios[level], has_outcome)
 
         for i in range(4 * (level + 1)):
-            log_ratios += np.asarray(of_step(i, keys, laws))
+            log_ratios += of_step(i, keys, laws)
     counts = np.bincount(laws, minlength=4)
     assert np.all(np.abs(counts - 4000 * mixture.shares) <= 4 * np.sqrt(counts))
-    weights = mixture.weights(jnp.asarray(log_ratios))
+    weights = mixture.weights(log_ratios)
     expected = 1 / (np.exp(log_ratios) @ mixture.shares)
     np.testing.assert_allclose(weights, expected, rtol=1e-12)
     assert np.max(weights) <= 2
