@@ -306,7 +306,11 @@ def _noise_frequency(problem: Problem) -> Float[Array, ""]:
 
     def frequency(key: PRNGKeyArray) -> Float[Array, ""]:
         controls = jr.rademacher(key, zeros.shape, zeros.dtype)
-        field = lambda t, y: change(y, controls)
+
+        def field(t: Array, y: Y) -> Y:
+            del t
+            return change(y, controls)
+
         return largest_frequency(field, problem.t0, problem.y0)
 
     return jnp.max(lax.map(frequency, jr.split(jr.key(0), _NUM_DIRECTIONS)))

@@ -70,8 +70,11 @@ def halved(levels: Level) -> Level:
 def with_next_level(levels: Level) -> Level:
     """The levels, and one more."""
     next_levels = dataclasses.replace(halved(levels), index=levels.index + 1)
-    append = lambda x, next_x: np.append(x, next_x[-1:], axis=0)
-    return jtu.tree_map(append, levels, next_levels)
+
+    def with_last(x: np.ndarray, next_x: np.ndarray) -> np.ndarray:
+        return np.append(x, next_x[-1:], axis=0)
+
+    return jtu.tree_map(with_last, levels, next_levels)
 
 
 class Combination(enum.IntEnum):

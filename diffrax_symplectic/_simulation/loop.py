@@ -134,8 +134,11 @@ def simulate(
 
         def with_measurement():
             t = problem.t0 + num_steps * level.h
-            phi_of = lambda y, args: problem.with_args(args).values(t, y)
-            phi = jax.vmap(phi_of)(paths.y, paths.args)
+
+            def phi_of_path(y: Y, args: PyTree[Array]) -> Array:
+                return problem.with_args(args).values(t, y)
+
+            phi = jax.vmap(phi_of_path)(paths.y, paths.args)
             failed = paths.failed | ~jax.vmap(all_finite)(phi)
             # `ts` may repeat a time, so several rows of `saved` may belong to this time.
             is_row_of_time = mask_like(level.saved_steps == num_steps, saved)

@@ -163,12 +163,14 @@ class Problem(eqx.Module):
                 args,
             )
 
+        def float_as_array(x: Any) -> Any:
+            # Integers are kept: they may be exponents or sizes.
+            return jnp.asarray(x) if type(x) is float else x
+
         # With arrays in place of Python numbers, other numbers compile nothing anew. But a
         # function of the user may need the numbers themselves, for example in an `if`.
         try:
-            # Integers are kept: they may be exponents or sizes.
-            as_array = lambda x: jnp.asarray(x) if type(x) is float else x
-            programs = programs_for(jtu.tree_map(as_array, args))
+            programs = programs_for(jtu.tree_map(float_as_array, args))
         except (ValueError, *NEED_VALUES):
             programs = None
         # Not within `except`: an error would be printed together with the one before.

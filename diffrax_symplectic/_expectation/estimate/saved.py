@@ -165,7 +165,7 @@ def fields_from(
         "key_data": arrays["key_data"],
         "layout": layout,
         "sampling": _sampling_from(header),
-        # Files of earlier versions have none.
+        # There are none for the mean at `t1` alone.
         "ts": arrays.get("ts"),
     }
 

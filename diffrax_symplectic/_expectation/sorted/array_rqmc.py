@@ -1,5 +1,6 @@
 """Array-RQMC: all paths of a randomization step together, sorted before each step."""
 
+import functools as ft
 import math
 import warnings
 from collections.abc import Callable
@@ -140,8 +141,8 @@ class ArrayRQMC(AbstractSampling):
         )
         # With halved steps the program is the same.
         finer_sampler = sampler_for(problem.with_halved_steps())
-        finer_plan = plan._replace(sampler=finer_sampler)
-        return plan._replace(with_halved_steps=lambda: finer_plan)
+        with_halved_steps = ft.partial(plan._replace, sampler=finer_sampler)
+        return plan._replace(with_halved_steps=with_halved_steps)
 
 
 def _samples_of_replicate(
