@@ -23,7 +23,7 @@ import re
 import threading
 import types
 import weakref
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -62,6 +62,11 @@ _MOST_REMEMBERED = 128
 _DIGITS_OF_FORMULAS = 2
 # Operations whose second argument XLA should know: it makes products and roots of powers.
 _KNOWN_SECOND = frozenset(["pow", "rem"])
+# Complex matrices and vectors with axes of up to this length are multiplied entry by entry.
+# On CPUs XLA calls a routine for each pair of them in a batch: the product of a 2 by 2
+# matrix and a vector takes 160 to 290 ns for each path, and its sums 4 ns; of two 8 by 8
+# matrices 440 to 530 and 220 to 310 ns.
+_LONGEST_AXIS = 8
 
 Result = TypeVar("Result")
 
@@ -116,7 +121,9 @@ def traced(fn: Callable, *inputs: PyTree, identity: Any = None) -> Traced:
     arrays = [leaf for is_it, leaf in zip(is_array, leaves) if is_it]
     make_jaxpr = jax.make_jaxpr(results, return_shape=True)
     closed_jaxpr, struct_of_result = make_jaxpr(*arrays)
-    jaxpr, text_numbers = _numbers_apart(closed_jaxpr.jaxpr)
+    jaxpr = closed_jaxpr.jaxpr
+    jaxpr = jaxpr.replace(eqns=[*map(_with_sums_of_products, jaxpr.eqns)])
+    jaxpr, text_numbers = _numbers_apart(jaxpr)
     # The leaves of the function come before those of the inputs. It has some if it is a
     # Module, or a `jax.tree_util.Partial`.
     fn_leaves = jtu.tree_leaves(fn)
@@ -175,9 +182,46 @@ def _with_dtype_of(aval: Any, x: Any) -> Array | np.ndarray:
     return x if has_dtype else jnp.asarray(x, aval.dtype)
 
 
+def _with_sums_of_products(eqn: JaxprEqn) -> JaxprEqn:
+    """The operation itself, or in place of a product of small complex arrays the sums that
+    it consists of."""
+    if eqn.primitive.name != "dot_general":
+        return eqn
+    arrays: list[Any] = [x.aval for x in eqn.invars]
+    structs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays]
+    axes = [size for struct in structs for size in struct.shape]
+    is_complex = any(jnp.issubdtype(x.dtype, jnp.complexfloating) for x in structs)
+    if not is_complex or max(axes, default=0) > _LONGEST_AXIS:
+        return eqn
+    sums = jax.jit(ft.partial(_sums_of_products, eqn.params["dimension_numbers"]))
+    [call] = jax.make_jaxpr(sums)(*structs).jaxpr.eqns
+    return eqn.replace(primitive=call.primitive, params=call.params)
+
+
+def _sums_of_products(dimension_numbers: Any, left: Array, right: Array) -> Array:
+    """`jax.lax.dot_general`, entry by entry."""
+    (left_summed, right_summed), (left_batch, right_batch) = dimension_numbers
+    num_batch = len(left_batch)
+    num_summed = len(left_summed)
+
+    def in_order(x: Array, batch: Sequence[int], summed: Sequence[int]) -> Array:
+        """The array with its axes of the batch first, and those to be summed last."""
+        others = [axis for axis in range(x.ndim) if axis not in (*batch, *summed)]
+        return jnp.transpose(x, (*batch, *others, *summed))
+
+    left = in_order(left, left_batch, left_summed)
+    right = in_order(right, right_batch, right_summed)
+    # The result has the axes of the batch, then the others on the left and on the right.
+    end_of_left = left.ndim - num_summed
+    num_right = right.ndim - num_batch - num_summed
+    left = jnp.expand_dims(left, range(end_of_left, end_of_left + num_right))
+    right = jnp.expand_dims(right, range(num_batch, end_of_left))
+    return jnp.sum(left * right, axis=tuple(range(-num_summed, 0)))
+
+
 def _numbers_apart(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:
     """The program with constants for numbers in its text, and these numbers."""
-    jaxpr = jaxpr.replace(eqns=[_with_inverse_of_divisor(eqn) for eqn in jaxpr.eqns])
+    jaxpr = jaxpr.replace(eqns=[*map(_with_inverse_of_divisor, jaxpr.eqns)])
     places = [
         OperandPlace(k, position)
         for k, eqn in enumerate(jaxpr.eqns)

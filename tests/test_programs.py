@@ -143,6 +143,37 @@ def test_programs_work_under_transformations():
     assert by_k(jnp.array(1.0)) == 2
 
 
+# Contracted, free and common axes, none of them, and more than one of each.
+@pytest.mark.parametrize(
+    "subscripts", ["ab,b->a", "ab,bc->ac", "a,a->", "ab,c->abc", "abcd,becd->abe"]
+)
+def test_products_of_small_complex_arrays_are_sums(subscripts):
+    product = ft.partial(jnp.einsum, subscripts)
+    operands, _ = subscripts.split("->")
+    sizes = dict(zip("abcde", (2, 3, 8, 4, 5)))
+    left, right = (
+        jr.normal(jr.key(number), [sizes[axis] for axis in axes], complex)
+        for number, axes in enumerate(operands.split(","))
+    )
+    program = traced(product, left, right)
+
+    def size(product, left):
+        return jnp.sum(jnp.abs(product(left, right)) ** 2)
+
+    assert "dot_general" not in str(jax.make_jaxpr(program)(left, right))
+    exact = product(left, right)
+    np.testing.assert_allclose(program(left, right), exact, rtol=1e-13, atol=1e-14)
+    exact = jax.grad(size, argnums=1)(product, left)
+    gradient = jax.grad(size, argnums=1)(program, left)
+    np.testing.assert_allclose(gradient, exact, rtol=1e-13, atol=1e-13)
+
+
+def test_products_of_large_or_real_arrays_are_left_to_xla():
+    for matrix in (jnp.ones((2, 2)), jnp.ones((2, 9), complex)):
+        program = traced(jnp.dot, matrix, matrix.T)
+        assert "dot_general" in str(jax.make_jaxpr(program)(matrix, matrix.T))
+
+
 @pytest.fixture
 def only_new_garbage():
     """To look through all that other tests left takes seconds."""
