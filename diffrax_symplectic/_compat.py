@@ -39,6 +39,8 @@ from jax.interpreters.partial_eval import dce_jaxpr as dce_jaxpr
 from jaxlib.mlir import ir
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
+from ._parts import parts_of, with_parts
+
 
 # Operations that only call a function, and the parameter that holds it.
 CALLS = {
@@ -135,22 +137,17 @@ def resolution(tree: diffrax.VirtualBrownianTree) -> Any:
 def direction(terms: PyTree[diffrax.AbstractTerm]) -> Any:
     """The sign of the direction of time in the solve that the terms come from. Terms from
     outside a solve run forward."""
-    leaves = jtu.tree_leaves(terms, is_leaf=_is_wrapped)
     # The same for all terms of a solve.
-    return next((leaf.direction for leaf in leaves if _is_wrapped(leaf)), 1)
+    return next((term.direction for term in parts_of(WrapTerm, terms)), 1)
 
 
 def reversed_in_time(terms: PyTree[diffrax.AbstractTerm]) -> PyTree:
     """The terms of a solve with the direction of time reversed."""
 
     def reversed_term(term: Any) -> Any:
-        return WrapTerm(term.term, -term.direction) if _is_wrapped(term) else term
+        return WrapTerm(term.term, -term.direction)
 
-    return jtu.tree_map(reversed_term, terms, is_leaf=_is_wrapped)
-
-
-def _is_wrapped(x: Any) -> bool:
-    return isinstance(x, WrapTerm)
+    return with_parts(WrapTerm, reversed_term, terms)
 
 
 def is_adjoint_term(term: diffrax.AbstractTerm) -> bool:

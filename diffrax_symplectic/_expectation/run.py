@@ -13,6 +13,7 @@ from jaxtyping import Array, Key, PRNGKeyArray, PyTree
 
 from .._arguments import check_untraced
 from .._custom_types import Devices
+from .._parts import parts_of, with_parts
 from .._simulation import Problem
 from .._solver import has_newton, without_newton
 from .batch import batch_moments, BatchMoments, quick_batch_moments
@@ -207,26 +208,19 @@ class _Batches:
         return moments_of_devices
 
 
-def _is_problem(x: Any) -> bool:
-    return isinstance(x, Problem)
-
-
 def _has_newton(sampler: Callable[..., Samples]) -> bool:
     """Whether Newton's method may solve steps of the paths that a sampler simulates."""
-    parts = jtu.tree_leaves(sampler, is_leaf=_is_problem)
-    return any(_is_problem(x) and has_newton(x.solver) for x in parts)
+    return any(has_newton(problem.solver) for problem in parts_of(Problem, sampler))
 
 
 def _by_sweeps_alone(sampler: Callable[..., Samples]) -> Callable[..., Samples]:
     """The sampler without Newton's method. Solvers within a user's own function, which
     reports its failures by itself, stay as they are."""
 
-    def by_sweeps_alone(x: Any) -> Any:
-        if not _is_problem(x):
-            return x
-        return dataclasses.replace(x, solver=without_newton(x.solver))
+    def by_sweeps_alone(problem: Problem) -> Problem:
+        return dataclasses.replace(problem, solver=without_newton(problem.solver))
 
-    return jtu.tree_map(by_sweeps_alone, sampler, is_leaf=_is_problem)
+    return with_parts(Problem, by_sweeps_alone, sampler)
 
 
 def _for_all_processes(sampler: Callable[..., Samples]) -> Callable[..., Samples]:

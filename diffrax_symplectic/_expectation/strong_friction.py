@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from .._brownian import zeros_and_unravel
 from .._compat import unwrapped
 from .._custom_types import Terms
-from .._programs import compiled
+from .._programs import compiled, once_for_each_signature
 from .._simulation import Problem
 from .._solver import (
     AbstractLangevinSplitting,
@@ -91,11 +91,7 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
             f"up to {most_friction:g} / `dt0`. Pass a smaller `dt0`."
         )
     has_flow = isinstance(solver, AbstractLangevinSplitting) and solver.has_flow
-    p0, q0 = problem.y0
-    force = ft.partial(_friction_force, problem, friction)
-    # Whether its program reads the positions: forces at several might be equal by chance.
-    # (A velocity has the shape of its momentum.)
-    may_change = not Dependence(force, q0, p0).independent(lambda q, velocity: q)
+    may_change = _may_change(problem)
     if most_friction is None and not has_flow and not may_change:
         return None
     friction_of_step = float(_friction_rate(problem)) * dt0
@@ -129,6 +125,17 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
         "mean, as of a diffusion. Pass a smaller `dt0`, in which the friction changes, or "
         "turns, by a small part."
     )
+
+
+@once_for_each_signature
+def _may_change(problem: Problem) -> bool:
+    """Whether the friction reads the positions. (Forces at several positions might be equal
+    by chance.)"""
+    _, friction, _ = split_friction(problem.terms)
+    force = ft.partial(_friction_force, problem, friction)
+    p0, q0 = problem.y0
+    # A velocity has the shape of its momentum.
+    return not Dependence(force, q0, p0).independent(lambda q, velocity: q)
 
 
 def _friction_force(

@@ -184,6 +184,7 @@ def warn_of_truncation(terms: PyTree, h: float, stacklevel: int) -> None:
         )
 
 
+@once_for_each_signature
 def has_discrete_increments(solver: diffrax.AbstractSolver) -> bool:
     """Whether a solver takes discrete increments only, as weak methods do: whether the path
     that it makes has them even for `want="strong"`."""

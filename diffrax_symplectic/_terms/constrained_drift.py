@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._arguments import check_takes
 from .._custom_types import Args
+from .._parts import parts_of, with_parts
 from .callers import AbstractCaller
 
 
@@ -68,8 +69,7 @@ def constraint_of(terms: PyTree[diffrax.AbstractTerm]) -> Constraint | None:
     several."""
     # The drift may be within a `MultiTerm`, and within Diffrax's wrapper for the direction
     # of time.
-    leaves = jtu.tree_leaves(terms, is_leaf=_is_constrained)
-    constraints = [leaf.constraint for leaf in leaves if _is_constrained(leaf)]
+    constraints = [term.constraint for term in parts_of(ConstrainedDrift, terms)]
     # The multipliers of all constraints belong to one equation: a step that keeps one
     # constraint would leave the other.
     if len(constraints) > 1:
@@ -82,18 +82,10 @@ def constraint_of(terms: PyTree[diffrax.AbstractTerm]) -> Constraint | None:
 
 def without_constraint(terms: _T) -> _T:
     """The same terms without their constraint, if they have one."""
-
-    def unconstrained(x: Any) -> Any:
-        return x.drift if _is_constrained(x) else x
-
-    return jtu.tree_map(unconstrained, terms, is_leaf=_is_constrained)
+    return with_parts(ConstrainedDrift, lambda term: term.drift, terms)
 
 
 def check_unconstrained(terms: PyTree[diffrax.AbstractTerm], caller_name: str) -> None:
     """Raises a `ValueError` if the terms have a constraint."""
     if constraint_of(terms) is not None:
         raise ValueError(f"`{caller_name}` takes no constrained terms. {KEEP}.")
-
-
-def _is_constrained(x: Any) -> bool:
-    return isinstance(x, ConstrainedDrift)

@@ -8,10 +8,10 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jax.tree_util as jtu
 from jaxtyping import Array, ArrayLike, PyTree
 
 from .._arguments import check_takes, checked_not_negative
+from .._parts import parts_of
 from .callers import AbstractCaller
 from .hamiltonian import hamiltonian_terms
 from .symplectic_gradients import IndexedNoise
@@ -42,11 +42,7 @@ class Lifted(AbstractCaller):
 
 def has_lifted(terms: PyTree) -> bool:
     """Whether these terms have Hamiltonians in another variable."""
-    return any(map(_is_lifted, jtu.tree_leaves(terms, is_leaf=_is_lifted)))
-
-
-def _is_lifted(x: Any) -> bool:
-    return isinstance(x, Lifted)
+    return len(parts_of(Lifted, terms)) > 0
 
 
 def lifted_terms(

@@ -23,6 +23,7 @@ from .._brownian import (
     UnspecifiedPath,
 )
 from .._compat import at_trace_time, is_traced, not_a_path
+from .._parts import parts_of, with_parts
 
 
 # The first seed of paths made from shapes beside paths of the user's, whose keys come from
@@ -53,12 +54,12 @@ def shapes_as_paths(terms: PyTree) -> PyTree:
     of its path."""
 
     def with_path(term: Any) -> Any:
-        shape = not_a_path(term) if _is_control(term) else None
+        shape = not_a_path(term)
         if shape is None:
             return term
         return eqx.tree_at(lambda term: term.control, term, as_path(shape))
 
-    return jtu.tree_map(with_path, terms, is_leaf=_is_control)
+    return with_parts(diffrax.ControlTerm, with_path, terms)
 
 
 def which_are_shapes(terms: PyTree) -> list[bool]:
@@ -71,7 +72,7 @@ def which_are_shapes(terms: PyTree) -> list[bool]:
 
 def brownian_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
     """All Brownian paths of the terms, one for each place."""
-    return [x for x in jtu.tree_leaves(terms, is_leaf=_is_path) if _is_path(x)]
+    return parts_of(diffrax.AbstractBrownianPath, terms)
 
 
 def random_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
@@ -112,11 +113,7 @@ def _are_equal(
 
 def replace_paths(terms: PyTree, new_path: Callable) -> PyTree:
     """The terms with `new_path(path)` in place of each Brownian path."""
-
-    def replace(x: Any) -> Any:
-        return new_path(x) if _is_path(x) else x
-
-    return jtu.tree_map(replace, terms, is_leaf=_is_path)
+    return with_parts(diffrax.AbstractBrownianPath, new_path, terms)
 
 
 def with_paths_for_shapes(terms: PyTree, make_path: Callable) -> PyTree:
@@ -175,11 +172,3 @@ def with_keys(terms: PyTree[diffrax.AbstractTerm], keys: list[Array]) -> PyTree:
         return jtu.tree_map(lambda x: next(remaining_keys) if is_key(x) else x, path)
 
     return replace_paths(terms, with_next_keys)
-
-
-def _is_path(x: Any) -> bool:
-    return isinstance(x, diffrax.AbstractBrownianPath)
-
-
-def _is_control(x: Any) -> bool:
-    return isinstance(x, diffrax.ControlTerm)

@@ -19,6 +19,7 @@ from .._arguments import check_pair, shapes, whole_number
 from .._brownian import increment_struct, num_noises, zeros_and_unravel
 from .._compat import ω
 from .._custom_types import Args, BM, IntScalarLike, RealScalarLike
+from .._parts import parts_of
 from .callers import AbstractCaller
 from .dependence import Dependence
 from .evaluation import call_user_function, check_real_energies, checked_energy
@@ -262,12 +263,7 @@ def hamiltonian_parts(
 ) -> list[Drift | HamiltonianNoise]:
     """The vector fields and noises in terms that come from Hamiltonians. The terms may be
     wrapped or have friction."""
-    leaves = jtu.tree_leaves(terms, is_leaf=_is_hamiltonian_part)
-    return [x for x in leaves if _is_hamiltonian_part(x)]
-
-
-def _is_hamiltonian_part(x: Any) -> bool:
-    return isinstance(x, Drift | HamiltonianNoise)
+    return parts_of((Drift, HamiltonianNoise), terms)
 
 
 def is_hamiltonian(term: diffrax.AbstractTerm) -> bool:

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, PyTree
 from .._brownian import num_noises, zeros_and_unravel
 from .._compat import unwrapped, ω
 from .._custom_types import Args, IntScalarLike, RealScalarLike, Terms, Y
+from .._parts import parts_of
 from .constrained_drift import without_constraint
 from .drift_and_noise import control_struct, flattened
 from .symplectic_gradients import HamiltonianNoise, OneNoise
@@ -92,12 +93,12 @@ def rate(drift: Terms, t: RealScalarLike, y: Y, args: Args) -> Y:
 def check_terms_fit_state(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
     """Raises a `ValueError` unless these are terms that fit the state `y0`. (A PyTree of
     terms, as some Diffrax solvers take, is not checked further.)"""
-    if not any(map(_is_term, jtu.tree_leaves(terms, is_leaf=_is_term))):
+    if not parts_of(diffrax.AbstractTerm, terms):
         raise ValueError(
             "`terms` must be Diffrax terms, such as `hamiltonian_terms(H0, noise, path)`"
             f"; got {type(terms).__name__}."
         )
-    if not _is_term(terms):
+    if not isinstance(terms, diffrax.AbstractTerm):
         return
     parts = tuple(flattened(without_constraint(terms)))
     # This check comes first, since its message names the term and its path.
@@ -109,10 +110,6 @@ def check_terms_fit_state(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) 
 
     # Tracing is enough: `apply` raises if a term does not fit.
     eqx.filter_eval_shape(total_change, t0)
-
-
-def _is_term(x: Any) -> bool:
-    return isinstance(x, diffrax.AbstractTerm)
 
 
 def check_increments(terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> None:

@@ -11,6 +11,7 @@ from jaxtyping import PyTree
 
 from ..._brownian import is_key, typed_key
 from ..._compat import is_traced, unwrapped
+from ..._parts import parts_of
 from ..._programs import Traced
 from ..drift_and_noise import flattened
 from ..langevin import BathNoise
@@ -29,7 +30,7 @@ def check_drifts_differ(terms: PyTree[diffrax.AbstractTerm]) -> None:
             continue
         # Functions that were traced already are compared by what they compute, which two
         # different functions may have in common. So they are not compared here.
-        if any(map(_is_program, jtu.tree_leaves(H0, is_leaf=_is_program))):
+        if parts_of(Traced, H0):
             continue
         # The result is not `True` but traced for Modules with traced parameters, which may
         # be equal or not.
@@ -44,10 +45,6 @@ def check_drifts_differ(terms: PyTree[diffrax.AbstractTerm]) -> None:
                 "`diffrax.MultiTerm(*terms.terms, *noise_terms(noise, path).terms)`."
             )
         earlier.append(H0)
-
-
-def _is_program(x: Any) -> bool:
-    return isinstance(x, Traced)
 
 
 def check_baths_have_own_noise(terms: PyTree[diffrax.AbstractTerm]) -> None:
