@@ -1,6 +1,7 @@
 """The pieces of a splitting: each moves momenta or positions, for a share of the step."""
 
 import abc
+import dataclasses
 import functools as ft
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
@@ -176,7 +177,11 @@ class AbstractPiece(eqx.Module):
 
     @abc.abstractmethod
     def move(self, setting: Setting, moving: Moving, number: int) -> Moving:
-        """The state after this piece. `number` is that of the first piece that is alike."""
+        """The state after this piece. `number` is that of the first piece that is alike.
+
+        Lengths in `setting` are positive in a solve backward in time, too. `rate` and
+        `apply` take the direction of time from the terms; any other motion multiplies its
+        length by `direction(setting.rest)`."""
 
 
 class Kick(AbstractPiece):
@@ -409,13 +414,18 @@ class Bath(AbstractPiece):
 
 def first_alike(pieces: tuple[AbstractPiece, ...]) -> tuple[int, ...]:
     """For each piece the number of the first piece that is alike, which is its own number
-    if none before it is. Flows that are alike share one state, kept under this number."""
+    if none before it is. Flows that are alike share one state, kept under this number.
+    Pieces are alike if all of their fields are: equal if static, else the same object."""
 
     def are_alike(one: AbstractPiece, other: AbstractPiece) -> bool:
-        if isinstance(one, Flow) and isinstance(other, Flow):
-            same_flow = one.flow is other.flow and one.steps == other.steps
-        else:
-            same_flow = type(one) is type(other)
-        return same_flow and one.share == other.share
+        if type(one) is not type(other):
+            return False
+        for field in dataclasses.fields(one):
+            value = getattr(one, field.name)
+            other_value = getattr(other, field.name)
+            is_static = field.metadata.get("static", False)
+            if not (value == other_value if is_static else value is other_value):
+                return False
+        return True
 
     return tuple([are_alike(x, piece) for x in pieces].index(True) for piece in pieces)

@@ -307,9 +307,9 @@ class Splitting(AbstractLangevinSplitting):
 
 
 def _checked_pieces(pieces: Any) -> tuple[AbstractPiece, ...]:
-    """The pieces as a tuple. Raises a `ValueError` unless they are kicks, baths, and either
-    flights or flows, the shares of each kind add up to one, and there are at most two
-    baths."""
+    """The pieces as a tuple. Raises a `ValueError` unless there are kicks, baths, and
+    either flights or flows, the shares of each kind of piece add up to one, and there are
+    at most two baths."""
     if not isinstance(pieces, list | tuple):
         raise ValueError(f"`pieces` must be a list of pieces; got {pieces!r}.")
     for piece in pieces:
@@ -321,12 +321,13 @@ def _checked_pieces(pieces: Any) -> tuple[AbstractPiece, ...]:
         if isinstance(piece, Flow):
             check_has_no_bath(piece.flow)
     has_flow = any(isinstance(piece, Flow) for piece in pieces)
-    kinds = (Kick, Bath, Flow if has_flow else Flight)
-    if any(not isinstance(piece, kinds) for piece in pieces):
+    if has_flow and any(isinstance(piece, Flight) for piece in pieces):
         raise ValueError(
             "A `Splitting` with a `Flow` has no `Flight`: the flow moves the positions."
         )
-    for kind in kinds:
+    # Those without which nothing moves, and all others.
+    needed = Kick, Bath, Flow if has_flow else Flight
+    for kind in dict.fromkeys((*needed, *map(type, pieces))):
         total = sum(piece.share for piece in pieces if isinstance(piece, kind))
         if abs(total - 1) > 1e-12:
             raise ValueError(

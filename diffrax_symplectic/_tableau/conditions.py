@@ -147,8 +147,8 @@ def drift_order(tableau: FlatTableau) -> int:
 
 def _unknown_tableau(tableau: AbstractTableau) -> NoReturn:
     raise ValueError(
-        "The conditions are known for `GeneralTableau`, `SeparableTableau`, "
-        f"`PartitionedTableau` and `AdditiveTableau`; got `{type(tableau).__name__}`."
+        "The conditions are known for the tableaus of this package; got "
+        f"`{type(tableau).__name__}`."
     )
 
 
@@ -198,12 +198,22 @@ def _(tableau: AdditiveTableau) -> dict:
     # A tableau without the space-time area has zeros here, and fails its conditions.
     B_H = tableau.B.get("H", np.zeros((len(alpha), len(c1))))
     beta_H = tableau.beta.get("H", np.zeros(len(c1)))
+    # The expansion has no other variables.
+    others = {
+        f"alpha.B[{name}]e": alpha @ matrix.sum(axis=1)
+        for name, matrix in tableau.B.items()
+        if name not in ("W", "H")
+    }
+    for name, weights in tableau.beta.items():
+        if name not in ("W", "H"):
+            others[f"beta[{name}].c1"] = weights @ c1
     return {
         **first,
         **second,
         "alpha.B[H]e - 1": alpha @ B_H.sum(axis=1) - 1,
         "beta[W].c1 - 1/2": tableau.beta["W"] @ c1 - 1 / 2,
         "beta[H].c1 + 1": beta_H @ c1 + 1,
+        **others,
     }
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._solver import AbstractPiece
 
 from .test_every_solver import OBABO
 from .test_langevin import MASS, moment_map, ORIGIN, stationary_moments, STIFFNESS, T
@@ -160,3 +161,25 @@ def test_pieces_that_are_no_splitting_are_refused():
         weak = ds.WeakBrownianPath((3,), KEY)
         terms = ds.langevin_terms(_quartic, 1.0, 0.7, weak)
         _solve(OBABO, terms, START)
+
+
+class Stretch(AbstractPiece):
+    """A piece with a parameter: momenta grow at a rate."""
+
+    rate: jax.Array
+
+    def move(self, setting, moving, number):
+        p, q = moving.y
+        return moving._replace(
+            y=(jnp.exp(setting.length(self.share) * self.rate) * p, q)
+        )
+
+
+def test_pieces_with_other_parameters_are_other_pieces():
+    first = Stretch(1 / 2, jnp.array(1.0))
+    last = Stretch(1 / 2, jnp.array(2.0))
+    pieces = [first, HALF_KICK, HALF_FLIGHT, ds.Bath(1), HALF_FLIGHT, HALF_KICK]
+    assert ds.Splitting([*pieces, first]).symmetric
+    assert not ds.Splitting([*pieces, last]).symmetric
+    with pytest.raises(ValueError, match="those of `Stretch` add up to 0.5"):
+        ds.Splitting(pieces)

@@ -183,6 +183,28 @@ def test_conditions_are_known_for_known_tableaus_and_variables():
     assert abs(strong["beta[H].c1 + 1"]) == 1
 
 
+def test_strong_order_three_halves_has_no_place_for_further_variables():
+    """The variable takes the place of the space-time area in the variances. Strong errors
+    of this tableau halve with the step."""
+    tableau = ds.AdditiveTableau(
+        alpha=[1],
+        beta={"W": [1], "H": [0], "sign": [0]},
+        A=[[0.5]],
+        B={"W": [[0.5]], "H": [[1]], "sign": [[(1 / 6) ** 0.5]]},
+        c1=[0.5],
+        constant=True,
+    )
+    # Constant noise does not need the condition on times.
+    residuals = ds.strong_order_residuals(tableau)
+    assert residuals.pop("beta[H].c1 + 1") == 1
+    assert residuals.pop("alpha.B[sign]e") == pytest.approx(6**-0.5)
+    assert np.max(np.abs([*residuals.values()])) < 1e-14
+    in_time = ds.AdditiveTableau(
+        [1], {"W": [1], "sign": [1]}, [[0.5]], {"W": [[0.5]]}, [0.5]
+    )
+    assert ds.strong_order_residuals(in_time)["beta[sign].c1"] == 0.5
+
+
 def test_noise_of_a_tableau_is_a_tuple_of_names():
     one = dict(alpha=[1], beta=[1], A0=[[0.5]], B0=[[0.5]], A1=[[0.5]], B1=[[0.5]])
     assert ds.GeneralTableau(**one, noise=["W"]).noise == ("W",)
