@@ -205,15 +205,20 @@ def with_constants_at(jaxpr: Jaxpr, places: Sequence[OperandPlace]) -> Jaxpr:
     operands.append(list(jaxpr.outvars))
     avals = [operands[place.operation][place.position].aval for place in places]
     structs = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
-    # The constructor of a variable differs between versions of JAX. So JAX makes them: they
-    # are the inputs of a trace of the identity.
-    new_constants = jax.make_jaxpr(lambda *xs: xs)(*structs).jaxpr.invars
-    for place, constant in zip(places, new_constants):
+    for place, constant in zip(places, _variables_like(*structs)):
         operands[place.operation][place.position] = constant
     *operands_of_eqns, results = operands
     eqns = [eqn.replace(invars=xs) for eqn, xs in zip(jaxpr.eqns, operands_of_eqns)]
-    constants = [*jaxpr.constvars, *new_constants]
+    constants = [*jaxpr.constvars, *_variables_like(*structs)]
     return jaxpr.replace(eqns=eqns, outvars=results, constvars=constants)
+
+
+@ft.lru_cache(maxsize=128)
+def _variables_like(*structs: jax.ShapeDtypeStruct) -> list[Any]:
+    """Variables of programs for arrays like these."""
+    # The constructor of a variable differs between versions of JAX. So JAX makes them: they
+    # are the inputs of a trace of the identity.
+    return jax.make_jaxpr(lambda *xs: xs)(*structs).jaxpr.invars
 
 
 # Made on import, since no such context may be made while other threads use JAX.
