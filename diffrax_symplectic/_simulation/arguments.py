@@ -32,7 +32,7 @@ from .._brownian import (
     typed_key,
 )
 from .._custom_types import Args, RealScalarLike, Y
-from .._programs import once_for_each_signature, Traced, traced
+from .._programs import once_for_each_signature, traced
 from .._solver import own_path
 from .._terms import (
     brownian_paths,
@@ -238,17 +238,17 @@ def state_itself(t, y, args):
 
 def _real_phi(phi: Callable, t: RealScalarLike, y: Y, args: Args) -> PyTree[Array]:
     values = call_user_function("phi", phi, t, y, args=args)
-    # A state may have empty arrays, which have no mean.
-    if phi is not state_itself:
-        check_real("phi", jtu.tree_leaves(values))
+    check_real("phi", jtu.tree_leaves(values))
     return values
 
 
 def traced_phi(
     phi: Callable, terms: PyTree, t0: Float[np.ndarray, ""], y0: Y, args: Args
-) -> Traced:
+) -> Callable[[RealScalarLike, Y, Args], PyTree]:
     """The program of `phi`. Raises an error unless it takes this state and returns real
     arrays. For spins and complex amplitudes, errors explain which state `phi` gets."""
+    if phi is state_itself:
+        return phi
     check_takes("phi", phi, "t", "y", "args")
     try:
         return traced(jtu.Partial(_real_phi, phi), t0, y0, args, identity=phi)
