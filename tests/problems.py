@@ -324,24 +324,6 @@ def local_weak_orders(terms, solver, y0, args, hs, order: int, **kwargs) -> list
     return [slope(hs, d) for d in np.moveaxis(defects, 1, 2).reshape(-1, len(hs))]
 
 
-def orders_of_a_splitting(solver, terms, velocity, y0, hs) -> list[float]:
-    """As above, of a solver that adds the flow of `velocity(t, y, args)` to `terms`. The
-    generator of the whole equation comes with the defect of a solver that takes it as a
-    term; what that one expects after a step is then exchanged for what `solver` expects."""
-    both = diffrax.MultiTerm(*terms.terms, diffrax.ODETerm(velocity))
-    fn = dict(fn=values_of_a_step)
-
-    def defect(h):
-        step = 0.1, 0.1 + h, y0
-        other = both, diffrax.Heun(), *step
-        exchange = ds.step_expectation(terms, solver, *step, **fn)
-        exchange = exchange - ds.step_expectation(*other, **fn)
-        return ds.weak_order_defect(*other, **fn, order=2) + exchange
-
-    defects = np.asarray(jax.jit(lambda hs: jax.lax.map(defect, hs))(hs))
-    return [slope(hs, d) for d in defects.T]
-
-
 class RecordingMeter(diffrax.AbstractProgressMeter):
     """Writes down what is asked of it."""
 

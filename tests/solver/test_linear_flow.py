@@ -11,7 +11,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._adjoint import _undoes_its_steps
 from diffrax_symplectic._solver import LANGEVIN
 
-from ..problems import Given, orders_of_a_splitting, weak_path
+from ..problems import Given, weak_path
 
 
 def _rest(t, p, q, args):
@@ -76,23 +76,10 @@ def test_orders_are_those_of_the_splitting_where_the_solver_has_higher_ones():
     assert orders(ds.SRKs1()) == [2, 1, 1.0]
     assert orders(_Own()) == [2, 1, 0.5]
     assert orders(ds.SRKw2())[1:] == [2, None]
-
-
-@pytest.mark.slow
-def test_noises_that_do_not_commute_leave_the_splitting_at_weak_order_two():
-    # Neither with each other nor with the flow.
-    def noise(t, p, q, args):
-        return jnp.stack([0.3 * jnp.sum(p * q), 0.15 * jnp.sum(q**2 - p**2)])
-
-    flow = waves(2, 1.0)
-    wave = lambda t, y, args: jax.jvp(lambda s: flow(s, y, args), (0.0,), (1.0,))[1]
-    terms = ds.hamiltonian_terms(_rest, noise, weak_path(2, two_point=True))
-    solver = ds.LinearFlow(ds.NinomiyaVictoir(), flow)
-    y0 = jnp.array([0.3, -0.4]), jnp.array([0.5, 0.1])
-    # The frequencies are 1 and 2.2.
-    hs = np.array([0.02, 0.01, 0.005])
-    slopes = orders_of_a_splitting(solver, terms, wave, y0, hs)
-    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
+    # It is implicit if its solver is.
+    implicit, explicit = wrap(ds.ImplicitMidpoint()), wrap(ds.StormerVerlet())
+    assert isinstance(implicit, diffrax.AbstractImplicitSolver)
+    assert not isinstance(explicit, diffrax.AbstractImplicitSolver)
 
 
 def test_linear_systems_without_a_rest_are_solved_exactly():
@@ -100,11 +87,15 @@ def test_linear_systems_without_a_rest_are_solved_exactly():
     nothing = lambda t, p, q, args: 0 * jnp.sum(q)
     terms = ds.hamiltonian_terms(nothing, nothing, Given(jnp.zeros(())))
     solver = ds.LinearFlow(ds.StormerVerlet(), flow)
+
+    @jax.jit
+    def solved_and_exact(end):
+        at = terms, solver, 0.0, end, end / 7, y0
+        sol = diffrax.diffeqsolve(*at, max_steps=8)
+        return [x[-1] for x in sol.ys], flow(end, y0, None)
+
     for end in (5.0, -5.0):
-        sol = diffrax.diffeqsolve(terms, solver, 0, end, end / 7, y0, max_steps=8)
-        np.testing.assert_allclose(
-            [x[-1] for x in sol.ys], flow(end, y0, None), atol=1e-12
-        )
+        np.testing.assert_allclose(*solved_and_exact(end), atol=1e-12)
 
 
 def test_what_a_solver_remembers_is_not_taken_for_where_the_flow_leads():
@@ -112,12 +103,16 @@ def test_what_a_solver_remembers_is_not_taken_for_where_the_flow_leads():
     flow = waves(8, 0.5)
     terms = ds.hamiltonian_terms(_rest)
     inner, y = _Own(), tuple(jr.normal(jr.key(0), (2, 8)))
-    solver = ds.LinearFlow(inner, flow)
-    sol = diffrax.diffeqsolve(terms, solver, 0, 0.6, 0.2, y, max_steps=4)
+    sol = diffrax.diffeqsolve(
+        terms, ds.LinearFlow(inner, flow), 0, 0.6, 0.2, y, max_steps=4
+    )
+
+    @jax.jit
+    def one_step(t, y):
+        return flow(0.1, _one_step(inner, terms, 0.2, flow(0.1, y, None), t), None)
+
     for i in range(3):
-        y = flow(0.1, y, None)
-        y = _one_step(inner, terms, 0.2, y, 0.2 * i)
-        y = flow(0.1, y, None)
+        y = one_step(0.2 * i, y)
     np.testing.assert_allclose([x[-1] for x in sol.ys], y, atol=1e-13)
 
 
@@ -149,17 +144,14 @@ def test_flows_that_are_none_are_refused():
         init(lambda time, y, args: (y[0], y[1][:4]))
     with pytest.raises(ValueError, match="is a pair"):
         init(flow, jnp.ones(8))
+    # The flow would follow what the solver follows, too.
+    slow = lambda t, q, args: _rest(t, q, q, args)
+    whole = ds.hamiltonian_terms(lambda t, p, q, args: p @ p, slow=slow)
+    with pytest.raises(ValueError, match="contain the rest alone"):
+        ds.LinearFlow(inner, flow).init(whole, 0.0, 0.1, y0, None)
     # One propagator for all steps.
     with pytest.raises(ValueError, match="does not depend on `time`"):
         init(lambda time, y, args: flow(0.05, y, args))
-
-
-def test_it_is_implicit_if_its_solver_is():
-    flow = waves(8, 0.1)
-    implicit = ds.LinearFlow(ds.ImplicitMidpoint(), flow)
-    explicit = ds.LinearFlow(ds.StormerVerlet(), flow)
-    assert isinstance(implicit, diffrax.AbstractImplicitSolver)
-    assert not isinstance(explicit, diffrax.AbstractImplicitSolver)
 
 
 BATH = r"`BAOAB\(linear_flow\(\.\.\.\)\)`.*`langevin_terms\(.*slow="
@@ -188,16 +180,6 @@ def test_heat_baths_are_refused_in_favour_of_baoab():
             solver = ds.LinearFlow(inner, flow)
             with pytest.raises(ValueError, match=f"no terms with friction.*{BATH}"):
                 diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0)
-
-
-def test_terms_of_the_whole_energy_with_a_slow_part_are_refused():
-    # The flow would follow what the solver follows, too.
-    whole = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2
-    slow = lambda t, q, args: _rest(t, q, q, args)
-    solver = ds.LinearFlow(ds.StormerVerlet(), waves(8, 0.1))
-    terms = ds.hamiltonian_terms(whole, slow=slow)
-    with pytest.raises(ValueError, match="contain the rest alone"):
-        solver.init(terms, 0.0, 0.1, (jnp.ones(8), jnp.ones(8)), None)
 
 
 def _drifting(omega):

@@ -1,7 +1,6 @@
 """Families for H0 = V(p) + U(t, q) with noise in the potential."""
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -13,7 +12,6 @@ from diffrax_symplectic._tableau import make_plan
 from examples._srkw2 import PaperSRKw2
 
 from .. import paper
-from ..families import slow_except
 from ..picard import by_picard
 from ..problems import (
     Given,
@@ -48,35 +46,35 @@ def test_no_step_depends_on_other_parameters_of_the_paper(make, solver):
         assert np.max(np.abs(ds.symplectic_residuals(make(x)))) <= 2e-15
 
 
-def _step(solver, W, h=0.1):
+def test_steps_are_those_that_the_docstrings_say():
     y0, args = _problem(jr.key(0), 2, 2)
-    solver = by_picard(solver)
-    terms = ds.hamiltonian_terms(H0, noise, Given(W))
-    step = lambda y0: solver.step(terms, 0.0, h, y0, args, None, False)
-    y1, *_, result = eqx.filter_jit(step)(y0)
-    assert result == diffrax.RESULTS.successful
-    return y1
+    t0, h, W = 0.3, 0.1, jnp.array([0.4, -0.3])
 
+    def steps_and_others(y0):
+        terms = ds.hamiltonian_terms(H0, noise, Given(W))
+        negated = ds.hamiltonian_terms(H0, noise, Given(-W))
+        drift, diffusion = terms.terms
+        (p, q), middle = y0, t0 + h / 2
 
-@pytest.mark.parametrize("pair", slow_except(["be"], ["ad", "be", "cf"]))
-def test_variants_d_e_f_are_a_b_c_at_negated_increments(pair):
-    W = jnp.array([0.4, -0.3])
-    plus, minus = (_step(ds.SRKw3(v), x) for v, x in zip(pair, (W, -W)))
-    for a, b in zip(plus, minus):
-        np.testing.assert_allclose(a, b, atol=1e-15)
+        def step(solver, terms=terms, y=y0):
+            solver = by_picard(solver)
+            return solver.step(terms, t0, t0 + h, y, args, None, False)[0]
 
+        kick = lambda q, t: diffusion.vf_prod(t, (p, q), args, W)[0]
+        # `SRKs2` is the midpoint rule, and `SRKw3` that after a kick.
+        yield step(ds.SRKs2()), step(ds.ImplicitMidpoint())
+        kicked = p + kick(q, t0), q
+        yield step(ds.SRKw3("c")), step(ds.ImplicitMidpoint(), drift, kicked)
+        for one, other in ("ad", "be", "cf"):
+            yield step(ds.SRKw3(one)), step(ds.SRKw3(other), negated)
+        # `StormerVerlet` drifts half a step, kicks and drifts again.
+        q = q + h / 2 * drift.vf(t0, (p, q), args)[1]
+        p = p + h * drift.vf(middle, (p, q), args)[0] + kick(q, middle)
+        q = q + h / 2 * drift.vf(t0, (p, q), args)[1]
+        yield step(ds.StormerVerlet()), (p, q)
 
-def test_srks2_is_the_midpoint_rule_and_srkw3_c_that_after_a_kick():
-    W = jnp.array([0.4, -0.3])
-    y0, args = _problem(jr.key(0), 2, 2)
-    terms = ds.hamiltonian_terms(H0, noise, Given(W))
-    drift, diffusion = terms.terms
-    kicked = y0[0] + diffusion.vf_prod(0.0, y0, args, W)[0], y0[1]
-    solver = by_picard(ds.ImplicitMidpoint())
-    midpoint = lambda terms, y: solver.step(terms, 0.0, 0.1, y, args, None, False)[0]
-    whole, after = jax.jit(lambda: (midpoint(terms, y0), midpoint(drift, kicked)))()
-    np.testing.assert_allclose(_step(ds.SRKs2(), W), whole, atol=1e-15)
-    np.testing.assert_allclose(_step(ds.SRKw3("c"), W), after, atol=1e-15)
+    for got, expected in jax.jit(lambda y0: [*steps_and_others(y0)])(y0):
+        np.testing.assert_allclose(got, expected, atol=1e-15, rtol=1e-15)
 
 
 def test_unused_halves_of_gradients_are_not_computed():
@@ -86,35 +84,23 @@ def test_unused_halves_of_gradients_are_not_computed():
     terms = ds.hamiltonian_terms(H0, noise, Given(jnp.array(0.1)))
     y0 = (jnp.ones(2), jnp.ones(2))
 
-    def count(fn, name):
-        text = jax.jit(fn).lower(y0).compile().as_text()
-        return text.count(f" {name}(")
+    def program(fn):
+        return jax.jit(fn).lower(y0).compile().as_text()
 
-    def step(solver):
-        return lambda y0: solver.step(terms, 0.0, 0.1, y0, None, None, False)[0]
+    def cosines(solver):
+        solver = by_picard(solver)
+        step = lambda y0: solver.step(terms, 0.0, 0.1, y0, None, None, False)[0]
+        return program(step).count(" cosine(")
 
     # Half of a gradient leaves the program if it is not asked for.
     half = lambda part: lambda y: terms.terms[0].vf_prod(0.0, y, None, 0.1)[part]
-    assert count(half(0), "tanh") == 0 and count(half(0), "exponential") > 0
-    assert count(half(1), "tanh") > 0 and count(half(1), "exponential") == 0
-    # Each kick evaluates the noise once.
-    for solver, kicks in ((ds.StormerVerlet(), 1), (ds.SRKw3("b"), 1), (ds.SRKw3(), 3)):
-        assert count(step(solver), "cosine") == kicks
-    assert count(step(ds.SRKs3()), "cosine") < count(step(ds.SRKs2()), "cosine")
-
-
-def test_stormer_verlet_drifts_half_a_step_kicks_and_drifts_again():
-    y0, args = _problem(jr.key(0), 2, 2)
-    t0, h, W = 0.3, 0.1, jnp.array([0.4, -0.3])
-    terms = ds.hamiltonian_terms(H0, noise, Given(W))
-    drift, diffusion = terms.terms
-    p, q = y0
-    q = q + h / 2 * drift.vf(t0, (p, q), args)[1]
-    kick = h * drift.vf(t0 + h / 2, (p, q), args)[0]
-    p = p + kick + diffusion.vf_prod(t0 + h / 2, (p, q), args, W)[0]
-    q = q + h / 2 * drift.vf(t0, (p, q), args)[1]
-    y1, *_ = ds.StormerVerlet().step(terms, t0, t0 + h, y0, args, None, False)
-    np.testing.assert_allclose(y1, (p, q), rtol=1e-15)
+    force, velocity = program(half(0)), program(half(1))
+    assert " exponential(" in force and " tanh(" not in force
+    assert " exponential(" not in velocity and " tanh(" in velocity
+    # Each kick evaluates the noise once, and that of `SRKw3` once more at its end.
+    for solver, kicks in ((ds.StormerVerlet(), 1), (ds.SRKw3("b"), 1), (ds.SRKw3(), 2)):
+        assert cosines(solver) == kicks
+    assert cosines(ds.SRKs3()) < cosines(ds.SRKs2())
 
 
 def test_explicit_methods_have_no_equation_to_solve():
