@@ -82,12 +82,11 @@ def _harmonic(slow):
     return terms, K, masses, ds.linear_flow(K, masses=masses)
 
 
-@pytest.mark.parametrize("h", slow_except([7.0], [0.1, 1.0, 7.0]))
-def test_the_flow_of_the_whole_energy_keeps_the_law_of_a_harmonic_system_exactly(h):
-    # omega h up to 70, friction gamma h up to 6.
+def test_the_flow_of_the_whole_energy_keeps_the_law_of_a_harmonic_system_exactly():
+    # omega h = 70, friction gamma h = 6.
     terms, K, masses, flow = _harmonic(None)
     for solver in (ds.BAOAB(ds.ImplicitMidpoint()), ds.BAOAB(flow)):
-        ((pp, qq),) = _stationary(solver, terms, h)
+        ((pp, qq),) = _stationary(solver, terms, 7.0)
         np.testing.assert_allclose(pp, T * np.diag(masses), atol=2e-8)
         np.testing.assert_allclose(qq, T * np.linalg.inv(K), atol=2e-8)
 
@@ -103,7 +102,7 @@ def test_a_harmonic_slow_force_leaves_an_error_of_order_two_or_by_cayleys_angles
         found = _stationary(solver, terms, *hs)
         return [np.max(abs(qq - exact)) for _, qq in found]
 
-    long, short = errors(ds.BAOAB(by_picard(ds.ImplicitMidpoint())), 0.1, 0.05)
+    long, short = errors(FLOWS["Verlet"], 0.1, 0.05)
     assert 1.95 < np.log2(long / short) < 2.05
     assert max(errors(ds.BAOAB(flow), 0.05, 0.4, 0.8)) < 1e-12
 
@@ -138,39 +137,21 @@ def test_friction_between_particles_and_inner_forces_keep_the_total_momentum():
     assert abs(jnp.sum(sol.ys[0][-1]) - jnp.sum(START[0])) < 2e-13
 
 
-def test_the_slow_force_is_evaluated_once_in_a_step():
-    calls = []
-
-    def counted(t, q, args):
-        jax.debug.callback(lambda: calls.append(1))
-        return _soft(t, q, args)
-
-    terms = _chain(counted)
-    solve = jax.jit(
-        lambda: diffrax.diffeqsolve(terms, FLOWS["Verlet"], 0, 10, 0.1, START).ys
-    )
-    jax.block_until_ready(solve())
-    jax.effects_barrier()
-    assert len(calls) == 101
-
-
 def test_other_solvers_take_the_slow_potential_as_a_part_of_the_energy():
     whole = lambda t, p, q, args: _stiff(t, p, q, args) + _soft(t, q, args)
     path = ds.WeakBrownianPath((N,), KEY)
     both = _chain(), ds.langevin_terms(whole, GAMMA, T, path)
     conservative = ds.hamiltonian_terms(_stiff, slow=_soft), ds.hamiltonian_terms(whole)
-    for solver, pair in (
+    cases = (
         (ds.BAOAB(), both),
-        (by_picard(ds.ImplicitMidpoint()), both),
         (diffrax.Heun(), both),
         (ds.StormerVerlet(), conservative),
-    ):
-        ends = jax.jit(
-            lambda y0, solver=solver, pair=pair: [
-                _one_step(solver, terms, 0.05, y0) for terms in pair
-            ]
-        )
-        np.testing.assert_allclose(*ends(START), rtol=1e-12)
+    )
+    ends = lambda y0: [
+        [_one_step(solver, terms, 0.05, y0) for terms in pair] for solver, pair in cases
+    ]
+    for got, expected in jax.jit(ends)(START):
+        np.testing.assert_allclose(got, expected, rtol=1e-12)
 
 
 @needs_drjit
@@ -229,56 +210,50 @@ def test_one_step_keeps_the_law_of_gibbs_of_masses_at_positions_to_second_order(
     assert np.max(abs(other)) > 3 * np.max(abs(short))
 
 
-def test_two_half_flows_are_a_step_of_the_midpoint_rule():
+def test_a_linear_flow_is_half_a_step_of_the_midpoint_rule():
     # Whose step is Cayley's transform, of which these are the square root.
     terms, h = ds.hamiltonian_terms(_stiff), 1.0
+    flow = jax.jit(lambda *x: CHAIN(*x))
+    half = flow(h / 2, START, None)
     expected = _one_step(ds.ImplicitMidpoint(), terms, h, START)
-    got = CHAIN(h / 2, CHAIN(h / 2, START, None), None)
-    for x, y in zip(got, expected):
+    for x, y in zip(flow(h / 2, half, None), expected):
         np.testing.assert_allclose(x, y, atol=1e-11)
-    energies = [_stiff(0.0, *y, None) for y in (START, CHAIN(h / 2, START, None))]
+    energies = [_stiff(0.0, *y, None) for y in (START, half)]
     np.testing.assert_allclose(energies[1], energies[0], rtol=1e-13)
-
-
-def test_modes_at_rest_drift_and_modes_that_are_given_are_those_of_the_matrix():
-    still = jnp.zeros(N), REST + 3.0
-    p = MASSES * 0.7
-    moved = CHAIN(0.5, (p, still[1]), None)
-    np.testing.assert_allclose(moved[0], p, atol=1e-13)
-    np.testing.assert_allclose(moved[1], still[1] + 0.35, atol=1e-13)
-    P, k = 6, 5.0
-    K = k * (2 * np.eye(P) - np.roll(np.eye(P), 1, 0) - np.roll(np.eye(P), -1, 0))
+    # Modes at rest drift.
+    p, q = MASSES * 0.7, REST + 3.0
+    moved = flow(0.5, (p, q), None)
+    np.testing.assert_allclose(moved, (p, q + 0.35), atol=1e-13)
+    # Modes that are given are those of the matrix.
+    n, k = 6, 5.0
+    K = k * (2 * np.eye(n) - np.roll(np.eye(n), 1, 0) - np.roll(np.eye(n), -1, 0))
     fourier = ds.linear_flow(
-        frequencies=2 * k**0.5 * np.sin(np.pi * np.arange(P // 2 + 1) / P),
+        frequencies=2 * k**0.5 * np.sin(np.pi * np.arange(n // 2 + 1) / n),
         to_modes=jnp.fft.rfft,
-        from_modes=lambda x: jnp.fft.irfft(x, P),
+        from_modes=lambda x: jnp.fft.irfft(x, n),
     )
     y = jnp.arange(6.0), jnp.cos(jnp.arange(6.0))
-    for x, z in zip(fourier(0.3, y, None), ds.linear_flow(K)(0.3, y, None)):
-        np.testing.assert_allclose(x, z, atol=1e-13)
+    flows = jax.jit(lambda y: [x(0.3, y, None) for x in (fourier, ds.linear_flow(K))])
+    np.testing.assert_allclose(*flows(y), atol=1e-13)
 
 
 def test_thermometers_show_what_a_step_leaves_of_the_temperature():
     # Of positions and of momenta, by second moments, without sampling.
-    terms, K, masses, _ = _harmonic(None)
+    terms, K, masses, flow = _harmonic(None)
     phi = ds.equipartition(terms)
-    for solver, h, kinetic, configurational in (
-        (ds.BAOAB(ds.ImplicitMidpoint()), 0.5, T, T),
-        (ds.BAOAB(), 0.05, None, T),
-    ):
+    for solver, h in ((ds.BAOAB(flow), 0.5), (ds.BAOAB(), 0.05)):
         ((pp, qq),) = _stationary(solver, terms, h)
-        roots = np.linalg.cholesky(pp), np.linalg.cholesky(qq)
-        # Of a quadratic form the mean is that over these columns.
-        each = [
-            phi(0.0, (jnp.asarray(p), jnp.asarray(q)), None)
-            for p, q in zip(*(root.T * 2**0.5 for root in roots))
-        ]
-        means = {name: sum(float(x[name]) for x in each) / 2 for name in each[0]}
-        np.testing.assert_allclose(means["configurational"], configurational, rtol=1e-9)
-        if kinetic is not None:
-            np.testing.assert_allclose(means["kinetic"], kinetic, rtol=1e-9)
-        else:
+        # Of a quadratic form the mean is that over the columns of the roots.
+        columns = [jnp.asarray(np.linalg.cholesky(x).T * 2**0.5) for x in (pp, qq)]
+        means = {
+            k: np.mean(x)
+            for k, x in jax.vmap(lambda *y: phi(0.0, y, None))(*columns).items()
+        }
+        np.testing.assert_allclose(means["configurational"], T, rtol=1e-9)
+        if solver == ds.BAOAB():
             assert means["kinetic"] < 0.99 * T
+        else:
+            np.testing.assert_allclose(means["kinetic"], T, rtol=1e-9)
     with pytest.raises(ValueError, match="takes no constrained terms"):
         ds.equipartition(ROD)
 
@@ -295,19 +270,15 @@ def test_a_suggestion_for_masses_that_depend_on_positions():
         found[0].solver.init(found[0].terms(KEY), 0.0, 0.1, y0, None)
 
 
-def test_a_flow_that_returns_nan_is_named():
-    # A mode of frequency zero, without a case for it.
-    def flow(time, y, args):
-        p, q = y
-        return p, q + jnp.sin(0.0 * time) / jnp.zeros(N) * p
-
-    with pytest.raises(ValueError, match="returned NaN"):
-        ds.BAOAB(flow).init(_chain(), 0.0, 0.1, START, None)
-
-
 def _call(solver, terms=None, y0=START):
     terms = _chain() if terms is None else terms
     return lambda: solver.init(terms, 0.0, 0.1, y0, None)
+
+
+def _divides_by_zero(time, y, args):
+    """A mode of frequency zero, without a case for it."""
+    p, q = y
+    return p, q + jnp.sin(0.0 * time) / jnp.zeros(N) * p
 
 
 QUARTIC = ds.langevin_terms(
@@ -335,6 +306,7 @@ SEES_NOTHING = ds.langevin_terms(
     "call, said",
     [
         (_call(ds.BAOAB(CHAIN), SEES_NOTHING), "Pass the whole Hamiltonian.*slow="),
+        (_call(ds.BAOAB(_divides_by_zero)), "returned NaN"),
         (lambda: ds.BAOAB(diffrax.Heun()), "solver of this package.* got `Heun`"),
         (lambda: ds.BAOAB(ds.BAOAB()), "`BAOAB` has a bath of its own"),
         (lambda: ds.BAOAB(3.0), "flow"),
