@@ -20,16 +20,6 @@ def as_friction(matrix):
     return lx.MatrixLinearOperator(jnp.asarray(matrix), lx.positive_semidefinite_tag)
 
 
-GENERAL = {
-    "ImplicitMidpoint": ds.ImplicitMidpoint(),
-    "SRKs1": ds.SRKs1(),
-    "SRKw1": ds.SRKw1(),
-    "SRKw1-0.2": ds.SRKw1(b=0.2),
-    "SRKw2": ds.SRKw2(),
-    "StrangGauss": ds.StrangGauss(),
-}
-
-
 class TrigonometricSum:
     """`H(p, q) = sum_j a_j cos(u_j . p + v_j . q + phi_j)`: smooth, bounded, and with no
     structure. The coefficients are `args[name]`, with a leading axis for the noises."""

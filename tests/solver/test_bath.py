@@ -1,9 +1,5 @@
 """The step of friction and noise for more momenta than are solved for in each step."""
 
-import os
-import subprocess
-import sys
-
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -13,6 +9,7 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._solver import bath
 
+from ..conftest import OPTIMIZED
 from ..problems import as_friction
 
 
@@ -105,31 +102,20 @@ def test_derivatives_are_those_of_the_equation_also_for_equal_rates():
         np.testing.assert_allclose(jacobian, exact_too, rtol=1e-12)
 
 
-_PROGRAM = """
-import jax, jax.numpy as jnp, jax.random as jr, diffrax, diffrax_symplectic as ds
-import lineax as lx
-jax.config.update("jax_enable_x64", True)
-n = 20
-H0 = lambda t, p, q, args: p @ p / 2 + jnp.sum(q**4)
-solver = ds.BAOAB()
-def friction(t, q, args):
-    return lx.MatrixLinearOperator(args, lx.positive_semidefinite_tag)
-terms = ds.langevin_terms(H0, friction, 1.0, solver.path((n,), jr.key(0)))
-def solve(y0, friction):
-    return diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0, friction).ys
-y0 = jnp.ones(n), jnp.ones(n)
-program = jax.jit(solve).lower(y0, jnp.eye(n) + 0.1).compile().as_text()
-before, entry = program.split("ENTRY")
-print("lapack" in entry, "lapack" in before)
-"""
-
-
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="LAPACK serves CPUs")
+@pytest.mark.skipif(not OPTIMIZED, reason="The suite leaves this optimization out")
+@pytest.mark.core
 @pytest.mark.slow
 def test_a_constant_matrix_is_diagonalized_once_before_the_loop_over_steps():
-    # As users compile it: the suite leaves this optimization out.
-    left_out = ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS")
-    env = {name: value for name, value in os.environ.items() if name not in left_out}
-    command = [sys.executable, "-c", _PROGRAM]
-    done = subprocess.run(command, capture_output=True, text=True, env=env)
-    assert done.stdout.split() == ["True", "False"], done.stderr
+    solver = ds.BAOAB()
+    friction = lambda t, q, args: as_friction(args)
+    path = solver.path((N,), jax.random.key(0))
+    terms = ds.langevin_terms(H0, friction, 1.0, path)
+
+    @jax.jit
+    def solve(y0, friction):
+        return diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0, friction).ys
+
+    program = solve.lower((P, Q), FULL).compile().as_text()
+    before, entry = program.split("ENTRY")
+    assert "lapack" in entry and "lapack" not in before

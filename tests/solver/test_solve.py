@@ -17,7 +17,6 @@ import diffrax_symplectic as ds
 
 from ..families import slow_except
 from ..problems import (
-    GENERAL,
     Given,
     H0,
     noise,
@@ -69,7 +68,7 @@ def _end_of_a_step(**options):
     # Two coupled stages, eight unknowns.
     y0, args = random_problem(jr.key(0), 2, 2)
     terms = ds.hamiltonian_terms(H0, noise, weak_path(2))
-    solver = dataclasses.replace(GENERAL["SRKw1-0.2"], **options)
+    solver = dataclasses.replace(ds.SRKw1(b=0.2), **options)
     step = lambda y0, args: solver.step(terms, 0.0, 0.1, y0, args, None, False)[0]
     return jax.jit(step)(y0, args)
 

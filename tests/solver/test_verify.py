@@ -41,34 +41,6 @@ def test_weak_order_defect_knows_ito_from_stratonovich_and_methods_of_lower_orde
     np.testing.assert_allclose(defects(), exact, atol=1e-15)
 
 
-def test_expectation_enumerates_second_and_two_point_variables():
-    class Read(diffrax.AbstractPath):
-        """Shows the extra variables to the vector field as if they were increments."""
-
-        path: ds.WeakBrownianPath
-        t0 = 0
-        t1 = 1
-
-        def evaluate(self, t0, t1=None, left=True):
-            inc = self.path.evaluate(t0, t1, use_levy=True)
-            return jnp.concatenate([inc.W, inc.second, inc.two_point])
-
-    path = weak_path(1, second=True, two_point=True)
-    identity = lambda t, y, args: jnp.eye(3)
-    terms = diffrax.MultiTerm(
-        diffrax.ODETerm(lambda t, y, args: jnp.zeros_like(y)),
-        diffrax.ControlTerm(identity, Read(path)),
-    )
-    h = 0.3
-    powers = lambda t, y, args: jnp.stack([jnp.outer(y, y), jnp.outer(y**2, y**2)])
-    second, fourth = ds.step_expectation(
-        terms, diffrax.Euler(), 0.0, h, jnp.zeros(3), fn=powers
-    )
-    np.testing.assert_allclose(second, h * np.eye(3), atol=1e-15)
-    expected = h**2 * np.array([[3, 1, 1], [1, 3, 1], [1, 1, 1]])
-    np.testing.assert_allclose(fourth, expected, atol=1e-15)
-
-
 def test_shapes_of_paths_are_told_to_be_shapes():
     field = lambda t, y, args: jax.tree.map(lambda x: x[..., None], y)
     control = diffrax.ControlTerm(field, (1,))  # pyright: ignore
