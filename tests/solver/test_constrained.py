@@ -413,6 +413,7 @@ def dimer(path, friction=1.0):
 DIMER = jnp.zeros((2, 3)), jnp.array([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]])
 
 
+@pytest.mark.slow
 def test_rigid_dimers_in_a_field_have_the_means_of_gibbs():
     terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
     paths = ds.ensemble(
@@ -430,9 +431,6 @@ def test_rigid_dimers_in_a_field_have_the_means_of_gibbs():
 
 
 PATH = ds.WeakBrownianPath((2, 3), jr.key(0))
-KICKED = ds.hamiltonian_terms(
-    dimer_energy, lambda t, p, q, args: jnp.sin(q), PATH, constraint=dimer_rod
-)
 
 
 def zigzag():
@@ -452,10 +450,9 @@ def zigzag():
     "terms, solver, y0",
     [
         (dimer(PATH), ds.BAOAB(), DIMER),
-        pytest.param(KICKED, ds.StormerVerlet(), DIMER, marks=pytest.mark.slow),
         pytest.param(*zigzag(), marks=pytest.mark.slow),
     ],
-    ids=["bath", "kicks", "bonds"],
+    ids=["bath", "bonds"],
 )
 def test_the_fused_engine_takes_the_same_steps(terms, solver, y0):
     at = terms, solver, 0, 0.4, 0.1, y0

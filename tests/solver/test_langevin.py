@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._solver import LANGEVIN
 from examples.hard_cases import double_well
 from examples.hard_cases._ensemble import gaussian
 from examples.hard_cases._stationary import stationary_bias, Step
@@ -50,10 +49,6 @@ def stationary_moments(terms, solver, h, y0):
     return moments.reshape(n, n)[1:, 1:]
 
 
-SPLITTINGS = [kind() for kind in LANGEVIN]
-quick_splitting = pytest.mark.parametrize(
-    "solver", slow_except(SPLITTINGS[:1], SPLITTINGS), ids=repr
-)
 ALL = {
     "BAOAB": ds.BAOAB(),
     "middle": ds.LangevinMiddle(),
@@ -163,8 +158,8 @@ def _diffrax_terms(path, gamma=GAMMA):
     )
 
 
-@quick_splitting
-def test_terms_of_diffrax_are_taken_as_they_are(solver):
+def test_terms_of_diffrax_are_taken_as_they_are():
+    solver = ds.BAOAB()
     path = solver.path((2,), jr.key(0), want="weak")
     x, v = jr.normal(jr.key(1), (2, 2))
     # More terms have the same state.
@@ -209,15 +204,7 @@ def _two_pendula(t, p, q, args):
 MATRIX = jnp.array([[1.0, 0.4], [0.4, 0.7]])
 
 
-each_flow = pytest.mark.parametrize(
-    "solver",
-    [ds.BAOAB(), pytest.param(ds.BAOAB(ds.StormerVerlet()), marks=pytest.mark.slow)],
-    ids=repr,
-)
-
-
-@each_flow
-def test_local_weak_order_is_two_where_friction_depends_on_positions_and_time(solver):
+def test_local_weak_order_is_two_where_friction_depends_on_positions_and_time():
     # The friction does not commute with the covariance of the noise.
     friction = lambda t, q, args: as_friction(MATRIX * jnp.cos(t + q[0] - q[1]))
     noise = lambda t, p, q, args: jnp.stack([q[0], jnp.sin(q[1] + q[0] * t)])
@@ -225,7 +212,7 @@ def test_local_weak_order_is_two_where_friction_depends_on_positions_and_time(so
     y0 = jnp.array([0.3, -0.4]), jnp.array([0.5, 0.1])
     hs = jnp.array([0.004, 0.002, 0.001])
     batch = jax.tree.map(lambda x: x[None], y0)
-    slopes = local_weak_orders(terms, solver, batch, None, hs, order=2)
+    slopes = local_weak_orders(terms, ds.BAOAB(), batch, None, hs, order=2)
     np.testing.assert_allclose(slopes, 3.0, atol=0.1)
 
 
