@@ -26,14 +26,15 @@ def gauss(X):
 
 
 def test_flows_are_steps_of_the_gauss_method_in_the_order_of_the_coin():
-    # Of quadratic energies, and so of linear fields. Drift or noise may be missing, and
-    # noises may come in several terms.
+    # Of quadratic energies, and so of linear fields. Those of noises depend on time, which
+    # stands still in the middle of the step. Drift or noise may be missing, and noises may
+    # come in several terms.
     rng = np.random.default_rng(0)
     energies = [S + S.T for S in rng.normal(size=(3, 2, 2))]
     h, W = 0.3, 0.3 * rng.normal(size=2)
     turned = [np.array([[0, -1], [1, 0]]) @ S for S in energies]
     half = gauss(h / 2 * turned[0])
-    first, second = (gauss(w * X) for w, X in zip(W, turned[1:]))
+    first, second = (gauss(np.exp(h / 2) * w * X) for w, X in zip(W, turned[1:]))
 
     def energy(*which):
         S = jnp.asarray(energies)[jnp.array(which)]
@@ -43,7 +44,8 @@ def test_flows_are_steps_of_the_gauss_method_in_the_order_of_the_coin():
     def terms(*noises, coins):
         path = Given(jnp.asarray(W)[jnp.array(noises) - 1], two_point=coins)
         drift = lambda *x: energy(0)(*x)[0]
-        return ds.hamiltonian_terms(drift, energy(*noises), path).terms
+        noise = lambda t, *x: jnp.exp(t) * energy(*noises)(t, *x)
+        return ds.hamiltonian_terms(drift, noise, path).terms
 
     @jax.jit
     def ends(y0):

@@ -408,8 +408,9 @@ def local_weak_orders(solver) -> dict[str, float]:
 
 
 # The outcomes of Lévy areas cannot be enumerated. Quick tests know the order of tableaus by
-# its conditions.
-@each(marked([s for s in TABLE if "A" not in s.variables], CORE[3:]))
+# its conditions, and the flows of `NinomiyaVictoir` one by one.
+@pytest.mark.slow
+@each([s for s in TABLE if "A" not in s.variables])
 def test_local_weak_order(solver):
     for kind, order in local_weak_orders(solver).items():
         claim = solver.record.order("weak", KINDS[kind])
@@ -568,6 +569,8 @@ def test_solvers_say_what_they_need():
             assert kind().minimal_levy_area is increment
     for solver in DEFAULTS:
         if hasattr(solver, "tableau"):
+            is_implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+            assert is_implicit == (len(solver.stage_vectors(5)) > 0)
             # The unknown vectors of each system of equations.
             blocks = make_plan(solver.tableau.flatten()).blocks
             sizes = (sum(map(len, block.unknown)) for block in blocks)

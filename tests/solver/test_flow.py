@@ -238,10 +238,8 @@ def test_thermometers_show_what_a_step_leaves_of_the_temperature():
         ((pp, qq),) = _stationary(solver, terms, h)
         # Of a quadratic form the mean is that over the columns of the roots.
         columns = [jnp.asarray(np.linalg.cholesky(x).T * 2**0.5) for x in (pp, qq)]
-        means = {
-            k: np.mean(x)
-            for k, x in jax.vmap(lambda *y: phi(0.0, y, None))(*columns).items()
-        }
+        found = jax.vmap(lambda *y: phi(0.0, y, None))(*columns)
+        means = {name: np.mean(values) for name, values in found.items()}
         np.testing.assert_allclose(means["configurational"], T, rtol=1e-9)
         if solver == ds.BAOAB():
             assert means["kinetic"] < 0.99 * T

@@ -1,6 +1,5 @@
 """Families for H0 = V(p) + U(t, q) with noise in the potential."""
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -101,13 +100,3 @@ def test_unused_halves_of_gradients_are_not_computed():
     for solver, kicks in ((ds.StormerVerlet(), 1), (ds.SRKw3("b"), 1), (ds.SRKw3(), 2)):
         assert cosines(solver) == kicks
     assert cosines(ds.SRKs3()) < cosines(ds.SRKs2())
-
-
-def test_explicit_methods_have_no_equation_to_solve():
-    y0, args = _problem(jr.key(0), 2, 2)
-    terms = ds.hamiltonian_terms(H0, noise, ds.PlateauVerlet().path((2,), jr.key(0)))
-    for solver in (ds.PlateauVerlet(), ds.StormerVerlet()):
-        assert not isinstance(solver, diffrax.AbstractImplicitSolver)
-        step = lambda y0, s=solver: s.step(terms, 0.0, 0.1, y0, args, None, False)[0]
-        text = str(jax.make_jaxpr(step)(y0))
-        assert "root_find" not in text and "triangular_solve" not in text
