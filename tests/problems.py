@@ -277,6 +277,12 @@ def damped_terms(H0, friction, noise=None, path=None) -> diffrax.MultiTerm:
     return diffrax.MultiTerm(*terms)
 
 
+def one_step(solver, terms, h, y0, t0=0.1):
+    """The end of the first step of a solve."""
+    state = solver.init(terms, t0, t0 + h, y0, None)
+    return solver.step(terms, t0, t0 + h, y0, None, state, False)[0]
+
+
 def slope(hs, errors):
     """The order that errors at several step sizes show, by least squares."""
     return np.polyfit(np.log(hs), np.log(np.abs(errors)), 1)[0]

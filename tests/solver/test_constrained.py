@@ -18,7 +18,7 @@ from ..families import slow_except
 from ..problems import as_friction, Given
 
 
-MASSES = jnp.array([1.0, 2.0, 0.5])[:, None]
+MASSES = jnp.array([1.0, 2.0])[:, None]
 
 
 def chain_energy(t, p, q, args):
@@ -27,11 +27,11 @@ def chain_energy(t, p, q, args):
 
 
 def gusts(t, p, q, args):
-    return 0.3 * jnp.stack([jnp.sin(q[0, 0] + q[2, 1]), jnp.cos(q[1, 0]) * q[2, 1]])
+    return 0.3 * jnp.stack([jnp.sin(q[0, 0] + q[1, 1]), jnp.cos(q[1, 0]) * q[1, 1]])
 
 
 def rods(q, args):
-    """Three rods of length 1, in a chain that hangs from the origin."""
+    """Two rods of length 1, in a chain that hangs from the origin."""
     return jnp.sum(jnp.diff(q, axis=0, prepend=0) ** 2, axis=1) - 1
 
 
@@ -43,7 +43,7 @@ def chain(path):
 @jax.vmap
 def chain_states(key):
     """Any allowed states."""
-    p, angles = jr.normal(key, (3, 2)), jr.uniform(key, (3,), maxval=2 * jnp.pi)
+    p, angles = jr.normal(key, (2, 2)), jr.uniform(key, (2,), maxval=2 * jnp.pi)
     steps = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
     terms = chain(ds.WeakBrownianPath((2,), jr.key(0)))
     return ds.constrained_state(terms, (p, jnp.cumsum(steps, axis=0)), 0.5)
@@ -223,12 +223,12 @@ def test_bad_starts_and_redundant_constraints_are_refused():
 
 def test_a_state_is_projected_in_the_metric_of_the_masses():
     terms = chain(ds.WeakBrownianPath((2,), jr.key(0)))
-    p, q = jr.normal(jr.key(3), (3, 2)), 0.9 * some_chain_state()[1]
+    p, q = jr.normal(jr.key(3), (2, 2)), 0.9 * some_chain_state()[1]
 
     @jax.jit
     def project(y, wind):
         y1 = ds.constrained_state(terms, y, wind)
-        return y1, [jax.jacfwd(rods)(x, None).reshape(3, 6) for x in (y[1], y1[1])]
+        return y1, [jax.jacfwd(rods)(x, None).reshape(2, 4) for x in (y[1], y1[1])]
 
     (p1, q1), (before, after) = jax.device_get(project((p, q), 0.5))
     assert np.max(np.abs(rods(q1, None))) <= 1e-15
@@ -411,23 +411,6 @@ def dimer(path, friction=1.0):
 
 
 DIMER = jnp.zeros((2, 3)), jnp.array([[0.5, 0.0, 0.0], [-0.5, 0.0, 0.0]])
-
-
-@pytest.mark.slow
-def test_rigid_dimers_in_a_field_have_the_means_of_gibbs():
-    terms = dimer(ds.WeakBrownianPath((2, 3), jr.key(0)))
-    paths = ds.ensemble(
-        terms, ds.BAOAB(), 0, 12, 0.12, DIMER, key=jr.key(1), num_paths=5000
-    )
-    p, q = paths.ys
-    energy = np.sum((p[:, 0] - p[:, 1]) ** 2, axis=1) / 4
-    seen = q[:, 0, 0] - q[:, 1, 0], energy, energy > TEMPERATURE
-    x = FIELD / TEMPERATURE
-    exact = 1 / np.tanh(x) - 1 / x, TEMPERATURE, np.exp(-1)
-    # The bias of this step is below a tenth of a standard error.
-    for values, mean in zip(seen, exact):
-        assert abs(np.mean(values) - mean) <= 3 * np.std(values) / len(values) ** 0.5
-    assert np.max(np.abs(np.sum((q[:, 0] - q[:, 1]) ** 2, axis=1) - 1)) <= 1e-14
 
 
 PATH = ds.WeakBrownianPath((2, 3), jr.key(0))

@@ -9,9 +9,6 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from examples.hard_cases import double_well
-from examples.hard_cases._ensemble import gaussian
-from examples.hard_cases._stationary import stationary_bias, Step
 
 from ..families import slow_except
 from ..problems import as_friction, damped_terms, Given, local_weak_orders, weak_path
@@ -132,19 +129,6 @@ def test_free_particles_drift_and_diffuse_as_einstein_says_for_any_step(case):
         covariances = [(x - np.outer(x[0], x[0]))[n + 1 :, n + 1 :] for x in moments]
         diffusion = np.diff(covariances, axis=0)[0] / (2 * h)
         np.testing.assert_allclose(diffusion, T * mobility, rtol=1e-10, atol=1e-11)
-
-
-def test_friction_that_depends_on_positions_leaves_a_bias_of_order_two():
-    # Without sampling, of the mean square of the position in a double well.
-    make = lambda path: double_well.langevin_terms(
-        path, friction=lambda t, q, args: 1 + jnp.tanh(q) / 2
-    )
-    V = lambda q: double_well.energy(0.0, q)
-    hs = [0.2, 0.1, 0.05]
-    step = Step(make, gaussian(), ds.BAOAB())
-    bias = stationary_bias(step, V, double_well.T, hs)[:, 0]
-    assert abs(bias[0]) <= 1.1e-3
-    np.testing.assert_allclose(bias[:-1] / bias[1:], 4.0, rtol=0.03)
 
 
 GAMMA, U = jnp.array([0.7, 0.2]), jnp.array([0.5, 2.0])

@@ -11,7 +11,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._adjoint import _undoes_its_steps
 from diffrax_symplectic._solver import LANGEVIN
 
-from ..problems import Given, weak_path
+from ..problems import Given, one_step, weak_path
 
 
 def _rest(t, p, q, args):
@@ -35,11 +35,6 @@ def modes(omega):
 
 
 FLOW = modes(jnp.arange(1.0, 9.0))
-
-
-def _one_step(solver, terms, h, y0, t0=0.1):
-    state = solver.init(terms, t0, t0 + h, y0, None)
-    return solver.step(terms, t0, t0 + h, y0, None, state, False)[0]
 
 
 class _Own(ds.AbstractSymplecticSolver):
@@ -107,11 +102,11 @@ def test_what_a_solver_remembers_is_not_taken_for_where_the_flow_leads():
     )
 
     @jax.jit
-    def one_step(t, y):
-        return FLOW(0.1, _one_step(inner, terms, 0.2, FLOW(0.1, y, None), t), None)
+    def split_step(t, y):
+        return FLOW(0.1, one_step(inner, terms, 0.2, FLOW(0.1, y, None), t), None)
 
     for i in range(3):
-        y = one_step(0.2 * i, y)
+        y = split_step(0.2 * i, y)
     np.testing.assert_allclose([x[-1] for x in sol.ys], y, atol=1e-13)
 
 
@@ -120,8 +115,8 @@ def test_steps_of_a_reversible_solver_are_undone():
     solver = ds.LinearFlow(ds.StormerVerlet(), FLOW)
     assert _undoes_its_steps(solver)
     terms, y0 = ds.hamiltonian_terms(_rest), tuple(jr.normal(jr.key(0), (2, 8)))
-    there = _one_step(solver, terms, 0.2, y0, 0.1)
-    back = _one_step(solver, terms, -0.2, there, 0.3)
+    there = one_step(solver, terms, 0.2, y0, 0.1)
+    back = one_step(solver, terms, -0.2, there, 0.3)
     np.testing.assert_allclose(back, y0, atol=1e-13)
     assert not _undoes_its_steps(ds.LinearFlow(ds.SRKw4(), FLOW))
 
