@@ -389,30 +389,25 @@ def _weak_systems(solver):
     return y0, args, np.asarray(over_steps(exact, _WEAK_STEPS, y0, args))
 
 
-def local_weak_orders(solver) -> dict[str, float]:
-    y0, args, exact = _weak_systems(solver)
-    path = solver.path((2,), jr.key(0), want="weak")
-    terms = terms_for(solver, path, commuting=True)
-    solver = by_picard(solver)
-
-    def mean(h, y0, args):
-        # Gaussian variables by quadrature.
-        kwargs = dict(fn=values_of_a_step, nodes=4)
-        return ds.step_expectation(terms, solver, 0.1, 0.1 + h, y0, args, **kwargs)
-
-    means = over_steps(mean, _WEAK_STEPS, y0, args, one_after_another)
-    defects = np.asarray(means) - exact
-    sizes = lambda i: np.linalg.norm(defects[2 * i : 2 * i + 2], axis=(0, 2))
-    kinds = _kinds(solver.structure)
-    return {kind: slope(_WEAK_STEPS, sizes(i)) - 1 for i, kind in enumerate(kinds)}
-
-
 # The outcomes of Lévy areas cannot be enumerated. Quick tests know the order of tableaus by
 # its conditions, and the flows of `NinomiyaVictoir` one by one.
 @pytest.mark.slow
 @each([s for s in TABLE if "A" not in s.variables])
 def test_local_weak_order(solver):
-    for kind, order in local_weak_orders(solver).items():
+    y0, args, exact = _weak_systems(solver)
+    path = solver.path((2,), jr.key(0), want="weak")
+    terms = terms_for(solver, path, commuting=True)
+    quick = by_picard(solver)
+
+    def mean(h, y0, args):
+        # Gaussian variables by quadrature.
+        kwargs = dict(fn=values_of_a_step, nodes=4)
+        return ds.step_expectation(terms, quick, 0.1, 0.1 + h, y0, args, **kwargs)
+
+    defects = over_steps(mean, _WEAK_STEPS, y0, args, one_after_another) - exact
+    for i, kind in enumerate(_kinds(solver.structure)):
+        sizes = np.linalg.norm(defects[2 * i : 2 * i + 2], axis=(0, 2))
+        order = slope(_WEAK_STEPS, sizes) - 1
         claim = solver.record.order("weak", KINDS[kind])
         assert abs(order - claim) <= 0.1, (kind, order)
 
@@ -461,20 +456,6 @@ def squared_errors(solver) -> np.ndarray:
     return np.sum((np.stack(coarse) - exact) ** 2, axis=-1)
 
 
-def strong_orders(solver) -> dict[str, tuple[float, float]]:
-    """Slopes of root mean squares over common paths, and their standard errors."""
-    squares = squared_errors(solver)
-    means = np.mean(squares, axis=-1, keepdims=True)
-    # A slope is a sum over logarithms of errors, and so, to first order, over paths.
-    x = -np.log(_STRONG_STEPS)
-    weights = (x - x.mean()) / np.sum((x - x.mean()) ** 2) / 2
-    orders = np.einsum("i,ik->k", weights, np.log(means[..., 0]))
-    parts = np.einsum("i,ikn->kn", weights, squares / means)
-    bars = np.std(parts, axis=-1) / np.sqrt(_STRONG_PATHS)
-    kinds = _kinds(solver.structure)
-    return dict(zip(kinds, zip(orders.tolist(), bars.tolist())))
-
-
 STRONG = [
     *filter(lambda s: s.record.strong is not None, DEFAULTS),
     ds.SRKs4(0.3, -0.7),
@@ -491,7 +472,15 @@ _ABOVE = {1 / 2: 0.2, 1: 0.3, 3 / 2: 0.5}
 # The order 1 of `StormerVerlet` is measured by `test_compare`, too.
 @each(marked(STRONG, ["SRKs4()"]))
 def test_strong_order(solver):
-    for kind, (order, bar) in strong_orders(solver).items():
+    squares = squared_errors(solver)
+    means = np.mean(squares, axis=-1, keepdims=True)
+    # A slope is a sum over logarithms of errors, and so, to first order, over paths.
+    x = -np.log(_STRONG_STEPS)
+    weights = (x - x.mean()) / np.sum((x - x.mean()) ** 2) / 2
+    orders = np.einsum("i,ik->k", weights, np.log(means[..., 0]))
+    parts = np.einsum("i,ikn->kn", weights, squares / means)
+    bars = np.std(parts, axis=-1) / np.sqrt(_STRONG_PATHS)
+    for kind, order, bar in zip(_kinds(solver.structure), orders, bars):
         claim = solver.record.order("strong", KINDS[kind])
         # With wider bars a slope of 1/2 would pass for the claim 1, of which 0.9 - 3 * 0.1
         # is the least that passes.
@@ -511,7 +500,7 @@ def test_the_default_sign_of_srks4_has_the_smaller_strong_error():
 
 
 @each([*DEFAULTS, *SPLIT])
-def test_own_paths_hold_what_a_step_needs(solver):
+def test_own_paths_hold_what_a_step_needs_and_others_are_refused(solver):
     system = SYSTEMS[solver.structure]
     y0, args = system.draw(jr.key(0), 1, 2, jnp.float64)
     # The test of weak orders takes a step along the other path.
@@ -527,24 +516,22 @@ def test_own_paths_hold_what_a_step_needs(solver):
     meant = "weak" if solver.record.strong is None else "strong"
     default, asked = (solver.path((2,), jr.key(0), want=w) for w in (None, meant))
     assert eqx.tree_equal(default, asked)
+    name = type(solver).__name__
+    if solver.structure != "any" and not isinstance(solver, ds.LinearFlow):
+        # Systems of another structure are refused.
+        system = SYSTEMS["any"]
+        other = system.draw(jr.key(0), 1, 2, jnp.float64)
+        with pytest.raises(ValueError, match=f"`{name}` needs"):
+            solver.init(system.terms(path), 0.0, 0.1, *other)
     # A path with less is refused with advice.
     terms = terms_for(solver, ds.FixedStepBrownianPath((2,), jr.key(0)))
     if solver.variables == ("W",) or has_friction(solver):
         return
-    name = type(solver).__name__
     with pytest.raises(ValueError, match=f"`{name}` needs") as info:
         solver.step(terms, 0.0, 0.1, y0, args, None, False)
     assert "by `solver.path(shape, key)`." in str(info.value)
     needed = most_demanding_variable(solver.variables)
     assert needed.name in str(info.value) or name == "NinomiyaVictoir"
-
-
-@each([s for s in [*DEFAULTS, *SPLIT[: len(LANGEVIN)]] if s.structure != "any"])
-def test_systems_of_another_structure_are_refused(solver):
-    y0, args = SYSTEMS["any"].draw(jr.key(0), 1, 2, jnp.float64)
-    terms = SYSTEMS["any"].terms(ds.WeakBrownianPath((2,), jr.key(0)))
-    with pytest.raises(ValueError, match=f"`{type(solver).__name__}` needs"):
-        solver.init(terms, 0.0, 0.1, y0, args)
 
 
 def test_bad_shapes_keys_and_wants_are_refused():
