@@ -175,7 +175,7 @@ def test_heat_baths_are_refused_in_favour_of_baoab():
                 ds.LinearFlow(inner, FLOW).init(terms, 0.0, 0.1, y0, None)
 
 
-def test_a_flow_that_returns_nan_is_named():
+def test_a_flow_that_returns_nan_is_named_and_in_a_batch_fails_its_path_alone():
     y0 = jnp.ones(2), jnp.ones(2)
     terms = ds.hamiltonian_terms(_rest)
     named = r"`flow\(time, y, args\)` returned NaN.*jnp.sinc"
@@ -186,14 +186,11 @@ def test_a_flow_that_returns_nan_is_named():
     with pytest.raises(Exception, match=named):
         jax.jit(lambda y0: solver.init(terms, 0.0, 0.1, y0, None))(y0)
 
-
-def test_in_a_batch_a_flow_that_returns_nan_fails_its_path_alone():
-    terms, y0 = ds.hamiltonian_terms(_rest), (jnp.ones(()), jnp.ones(()))
-
     @jax.jit
     @jax.vmap
     def run(omega):
         solver = ds.LinearFlow(ds.StormerVerlet(), modes(omega))
+        y0 = jnp.ones(()), jnp.ones(())
         sol = diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0, throw=False)
         return sol.result == diffrax.RESULTS.nonfinite, sol.ys[1][-1]
 

@@ -25,10 +25,8 @@ def test_small_changes_are_added_before_they_are_added_to_the_state():
 def test_blocks_without_unknowns_do_not_call_for_the_safety_net():
     # It has no iterations here.
     solver = ds.SRKw3("b", root_finder=ds.PicardNewton(newton_steps=0))
-    assert [len(b.unknown) for b in make_plan(solver.tableau.flatten()).blocks] == [
-        1,
-        0,
-    ]
+    blocks = make_plan(solver.tableau.flatten()).blocks
+    assert [len(block.unknown) for block in blocks] == [1, 0]
     H0 = lambda t, p, q, args: jnp.sum(jnp.cosh(p) - jnp.cos(q))
     noise = lambda t, p, q, args: jnp.sum(jnp.sin(q))
     terms = ds.hamiltonian_terms(H0, noise, Given(jnp.array(0.1)))

@@ -1,5 +1,7 @@
 """Exact checks of one step: symplecticity, weak orders, moments."""
 
+import functools as ft
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -41,22 +43,10 @@ def test_weak_order_defect_knows_ito_from_stratonovich_and_methods_of_lower_orde
     np.testing.assert_allclose(defects(), exact, atol=1e-15)
 
 
-def test_shapes_of_paths_are_told_to_be_shapes():
-    field = lambda t, y, args: jax.tree.map(lambda x: x[..., None], y)
-    control = diffrax.ControlTerm(field, (1,))  # pyright: ignore
-    drift, noise = kubo_terms(()).terms
-    says = r"pass `path=solver.path\(shape, key\)`"
-    for term in (noise, control):
-        terms = diffrax.MultiTerm(drift, term)
-        at = terms, ds.ImplicitMidpoint(), 0.0, 0.1, (jnp.array(0.0), jnp.array(1.0))
-        with pytest.raises(ValueError, match=says):
-            ds.second_moment_map(*at)
-        with pytest.raises(ValueError, match=says):
-            ds.step_expectation(*at, fn=lambda t, y, args: y[0])
-
-
 def test_expectation_needs_paths_of_known_laws():
-    y0 = (jnp.array(0.0), jnp.array(1.0))
+    y0 = jnp.array(0.0), jnp.array(1.0)
+    fn = lambda t, y, args: y[0]
+    at = ds.ImplicitMidpoint(), 0.0, 0.1, y0
     area = diffrax.SpaceTimeLevyArea
     cut = ds.TruncatedBrownianPath(diffrax.UnsafeBrownianPath((), jr.key(0), area))
     known = kubo_terms(ds.WeakBrownianPath((), jr.key(0)))
@@ -67,9 +57,18 @@ def test_expectation_needs_paths_of_known_laws():
         diffrax.MultiTerm(known.terms[0]),
     ):
         with pytest.raises(ValueError, match="must hold Brownian paths whose laws"):
-            ds.step_expectation(
-                terms, ds.ImplicitMidpoint(), 0.0, 0.1, y0, fn=lambda t, y, a: y[0]
-            )
+            ds.step_expectation(terms, *at, fn=fn)
+    # Shapes of paths are told to be shapes.
+    field = lambda t, y, args: jax.tree.map(lambda x: x[..., None], y)
+    control = diffrax.ControlTerm(field, (1,))  # pyright: ignore
+    drift, noise = kubo_terms(()).terms
+    for term in (noise, control):
+        terms = diffrax.MultiTerm(drift, term)
+        for call in (ds.second_moment_map, ft.partial(ds.step_expectation, fn=fn)):
+            with pytest.raises(
+                ValueError, match=r"pass `path=solver.path\(shape, key\)`"
+            ):
+                call(terms, *at)
 
 
 def test_symplecticity_defect_sees_a_method_that_is_not_symplectic_and_needs_a_pair():
