@@ -104,45 +104,39 @@ def test_a_failure_of_any_flow_is_reported():
 def test_one_noise_alone_is_that_noise_of_all():
     # For every way to give noises: one function of all, one of the index, several terms, a
     # matrix of noises, a Lineax operator.
-    m, (p, q) = 3, random_problem(jr.key(0), 2, 3)[0]
-    args = random_problem(jr.key(0), 2, m)[1]
-    W = jr.normal(jr.key(1), (m,))
-    restrict = lambda args, i: {"noise": jax.tree.map(lambda x: x[i], args["noise"])}
-    indexed = ds.IndexedNoise(
-        lambda k, t, p, q, args: noise(t, p, q, restrict(args, k)), m
-    )
-    first = lambda t, p, q, args: noise(t, p, q, restrict(args, slice(0, 1)))
-    rest = lambda t, p, q, args: noise(t, p, q, restrict(args, slice(1, None)))
-    term = lambda fn, W: ds.hamiltonian_terms(H0, fn, Given(W)).terms[1]
+    m = 3
+    (p, q), args = random_problem(jr.key(0), 2, m)
+    W, y = jr.normal(jr.key(1), (m,)), jnp.concatenate([p, q])[:m]
+
+    def some(which):
+        part = lambda args: {"noise": jax.tree.map(lambda x: x[which], args["noise"])}
+        return lambda t, p, q, args: noise(t, p, q, part(args))
+
+    indexed = ds.IndexedNoise(lambda k, t, p, q, args: some(k)(t, p, q, args), m)
+    term = lambda fn, W=W: ds.hamiltonian_terms(H0, fn, Given(W)).terms[1]
     matrix = lambda t, y, args: jnp.outer(jnp.sin(y + t), jnp.arange(1.0, m + 1))
     diagonal = lambda t, y, args: lx.DiagonalLinearOperator(jnp.sin(y + t))
-    y = jnp.concatenate([p, q])[:m]
+    forms = (
+        ([term(noise)], (p, q)),
+        ([term(indexed)], (p, q)),
+        ([term(some(slice(0, 1)), W[:1]), term(some(slice(1, m)), W[1:])], (p, q)),
+        ([diffrax.ControlTerm(matrix, Given(W))], y),
+        ([diffrax.ControlTerm(diagonal, Given(W))], y),
+    )
 
-    def deviations(t):
-        both = (p, q)
-        forms = {
-            "function": ((term(noise, W),), both),
-            "index": ((term(indexed, W),), both),
-            "terms": ((term(first, W[:1]), term(rest, W[1:])), both),
-            "matrix": ((diffrax.ControlTerm(matrix, Given(W)),), y),
-            "operator": ((diffrax.ControlTerm(diagonal, Given(W)),), y),
-        }
+    def values(t):
+        for terms, y in forms:
+            flat, unravel = jfu.ravel_pytree([term.contr(0.0, 1.0) for term in terms])
 
-        def deviation(terms, y):
-            controls = [term.contr(0.0, 1.0) for term in terms]
-            flat, unravel = jfu.ravel_pytree(controls)
-
-            def one(k):
+            def one(k, terms=tuple(terms), y=y, flat=flat, unravel=unravel):
                 alone = unravel(jnp.where(jnp.arange(m) == k, flat, 0))
                 expected = apply(terms, alone, args, t, y)
                 got = apply_one(terms, k, flat[k], args, t, y)
                 return jfu.ravel_pytree(got)[0], jfu.ravel_pytree(expected)[0]
 
-            return jax.vmap(one)(jnp.arange(m))
+            yield jax.vmap(one)(jnp.arange(m))
 
-        return {name: deviation(*form) for name, form in forms.items()}
-
-    for got, expected in jax.jit(deviations)(0.3).values():
+    for got, expected in jax.jit(lambda t: [*values(t)])(0.3):
         np.testing.assert_allclose(got, expected, atol=1e-15)
         # No two noises are alike.
         assert np.min(np.abs(np.diff(expected, axis=0)).max(axis=1)) > 1e-3

@@ -47,21 +47,14 @@ def _solve(solver, terms, y0, h=0.1):
 START = jnp.array([0.3, -0.4, 0.1]), jnp.array([1.0, 0.2, -0.5])
 
 
-def _with_flow(flow, steps=1):
-    half = ds.Flow(1 / 2, flow, steps)
-    return ds.Splitting([HALF_KICK, half, ds.Bath(1), half, HALF_KICK])
-
-
 def test_the_solvers_with_names_are_their_pieces():
+    half = ds.Flow(1 / 2, ds.StormerVerlet(), 2)
+    flows = ds.Splitting([HALF_KICK, half, ds.Bath(1), half, HALF_KICK])
     slow = lambda t, q, args: jnp.sum(jnp.cos(q))
     cases = (
         (BAOAB, ds.BAOAB(), {}),
         (MIDDLE, ds.LangevinMiddle(), {}),
-        (
-            _with_flow(ds.StormerVerlet(), steps=2),
-            ds.BAOAB(ds.StormerVerlet(), steps=2),
-            {"slow": slow},
-        ),
+        (flows, ds.BAOAB(ds.StormerVerlet(), steps=2), {"slow": slow}),
     )
     for pieces, named, options in cases:
         terms = _terms(named, **options)
