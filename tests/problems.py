@@ -20,16 +20,6 @@ def as_friction(matrix):
     return lx.MatrixLinearOperator(jnp.asarray(matrix), lx.positive_semidefinite_tag)
 
 
-GENERAL = {
-    "ImplicitMidpoint": ds.ImplicitMidpoint(),
-    "SRKs1": ds.SRKs1(),
-    "SRKw1": ds.SRKw1(),
-    "SRKw1-0.2": ds.SRKw1(b=0.2),
-    "SRKw2": ds.SRKw2(),
-    "StrangGauss": ds.StrangGauss(),
-}
-
-
 class TrigonometricSum:
     """`H(p, q) = sum_j a_j cos(u_j . p + v_j . q + phi_j)`: smooth, bounded, and with no
     structure. The coefficients are `args[name]`, with a leading axis for the noises."""
@@ -287,6 +277,12 @@ def damped_terms(H0, friction, noise=None, path=None) -> diffrax.MultiTerm:
     return diffrax.MultiTerm(*terms)
 
 
+def one_step(solver, terms, h, y0, t0=0.1):
+    """The end of the first step of a solve."""
+    state = solver.init(terms, t0, t0 + h, y0, None)
+    return solver.step(terms, t0, t0 + h, y0, None, state, False)[0]
+
+
 def slope(hs, errors):
     """The order that errors at several step sizes show, by least squares."""
     return np.polyfit(np.log(hs), np.log(np.abs(errors)), 1)[0]
@@ -322,24 +318,6 @@ def local_weak_orders(terms, solver, y0, args, hs, order: int, **kwargs) -> list
 
     defects = np.asarray(over_steps(defect, hs, y0, args))
     return [slope(hs, d) for d in np.moveaxis(defects, 1, 2).reshape(-1, len(hs))]
-
-
-def orders_of_a_splitting(solver, terms, velocity, y0, hs) -> list[float]:
-    """As above, of a solver that adds the flow of `velocity(t, y, args)` to `terms`. The
-    generator of the whole equation comes with the defect of a solver that takes it as a
-    term; what that one expects after a step is then exchanged for what `solver` expects."""
-    both = diffrax.MultiTerm(*terms.terms, diffrax.ODETerm(velocity))
-    fn = dict(fn=values_of_a_step)
-
-    def defect(h):
-        step = 0.1, 0.1 + h, y0
-        other = both, diffrax.Heun(), *step
-        exchange = ds.step_expectation(terms, solver, *step, **fn)
-        exchange = exchange - ds.step_expectation(*other, **fn)
-        return ds.weak_order_defect(*other, **fn, order=2) + exchange
-
-    defects = np.asarray(jax.jit(lambda hs: jax.lax.map(defect, hs))(hs))
-    return [slope(hs, d) for d in defects.T]
 
 
 class RecordingMeter(diffrax.AbstractProgressMeter):

@@ -1,9 +1,5 @@
 """The step of friction and noise for more momenta than are solved for in each step."""
 
-import os
-import subprocess
-import sys
-
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -13,6 +9,7 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._solver import bath
 
+from ..conftest import OPTIMIZED
 from ..problems import as_friction
 
 
@@ -41,8 +38,7 @@ def _friction_term(friction):
 
 
 def _after(terms, args=None):
-    step = lambda: bath.after_friction(terms, 0.0, 0.1, (P, Q), args, KICK)
-    return jax.jit(step)()
+    return bath.after_friction(terms, 0.0, 0.1, (P, Q), args, KICK)
 
 
 def _exact(friction):
@@ -50,36 +46,34 @@ def _exact(friction):
     return P + np.linalg.solve(np.eye(N) + 0.05 * A, -0.1 * A @ P + KICK)
 
 
-@pytest.mark.parametrize(
-    "friction, direction", [(FULL, 1), (PAIRS, -1)], ids=["full", "pairs back"]
-)
-def test_friction_by_its_modes_solves_the_equation_of_the_step(friction, direction):
-    (term,) = _friction_term(friction)
-    # As Diffrax passes it to a solver.
-    wrapped = diffrax._term.WrapTerm(term, direction)
-    assert bath._matrices_if_constant((wrapped,), 0.0, (P, Q), None) is not None
-    exact = _exact(direction * friction)
-    np.testing.assert_allclose(_after((wrapped,)), exact, rtol=0, atol=1e-13)
+def _modes(terms, args=None):
+    return bath._matrices_if_constant(terms, 0.0, (P, Q), args)
 
 
-def test_modes_serve_what_is_the_same_at_all_times_and_positions_and_nothing_else():
-    def modes(friction, args=None):
-        terms = _friction_term(friction)
-        return bath._matrices_if_constant(terms, 0.0, (P, Q), args)
-
-    assert modes(lambda t, q, args: args * FULL, jnp.array(2.0)) is not None
-    assert modes(lambda t, q, args: (1 + t) * FULL) is None
-    assert modes(lambda t, q, args: (1 + q[0] ** 2) * FULL) is None
-    heavier = lambda t, p, q, args: (1 + q[0] ** 2) * jnp.sum(p**2)
-    terms = ds.bath_terms(heavier, as_friction(FULL)).terms
-    assert bath._matrices_if_constant(terms, 0.0, (P, Q), None) is None
+def test_friction_by_its_modes_or_not_solves_the_equation_of_the_step():
     two = (*_friction_term(FULL), *_friction_term(PAIRS))
-    assert bath._matrices_if_constant(two, 0.0, (P, Q), None) is None
-    np.testing.assert_allclose(_after(two), _exact(FULL + PAIRS), rtol=0, atol=1e-13)
-
-
-def test_a_matrix_of_a_function_that_is_not_semidefinite_fails():
-    assert np.all(np.isnan(_after(_friction_term(lambda t, q, args: -FULL))))
+    # Modes serve what is the same at all times and positions, and nothing else.
+    assert _modes(_friction_term(lambda t, q, args: args * FULL), jnp.array(2.0))
+    heavier = lambda t, p, q, args: (1 + q[0] ** 2) * jnp.sum(p**2)
+    for terms in (
+        _friction_term(lambda t, q, args: (1 + t) * FULL),
+        _friction_term(lambda t, q, args: (1 + q[0] ** 2) * FULL),
+        ds.bath_terms(heavier, as_friction(FULL)).terms,
+        two,
+    ):
+        assert _modes(terms) is None
+    # As Diffrax passes it to a solver.
+    wrap = lambda friction, direction: tuple(
+        diffrax._term.WrapTerm(term, direction) for term in _friction_term(friction)
+    )
+    forward, backward = wrap(FULL, 1), wrap(PAIRS, -1)
+    assert _modes(forward) is not None and _modes(backward) is not None
+    indefinite = _friction_term(lambda t, q, args: -FULL)
+    cases = forward, backward, two, indefinite
+    *got, failed = jax.jit(lambda: [_after(terms) for terms in cases])()
+    for end, friction in zip(got, (FULL, -PAIRS, FULL + PAIRS)):
+        np.testing.assert_allclose(end, _exact(friction), rtol=0, atol=1e-13)
+    assert np.all(np.isnan(failed))
 
 
 def test_derivatives_are_those_of_the_equation_also_for_equal_rates():
@@ -95,39 +89,33 @@ def test_derivatives_are_those_of_the_equation_also_for_equal_rates():
         right = -0.1 * A @ P + KICK
         return weights @ (P + jnp.linalg.solve(jnp.eye(N) + 0.05 * A, right))
 
-    for derivative in (jax.grad, jax.jacfwd):
-        got, exact = (jax.jit(derivative(fn)) for fn in (by_modes, by_solve))
-        for friction in (FULL, jnp.eye(N)):
-            np.testing.assert_allclose(
-                got(1.2, friction), exact(1.2, friction), rtol=1e-12
-            )
+    def derivatives(scale, friction):
+        return [
+            derivative(fn)(scale, friction)
+            for derivative in (jax.grad, jax.jacfwd)
+            for fn in (by_modes, by_solve)
+        ]
 
-
-_PROGRAM = """
-import jax, jax.numpy as jnp, jax.random as jr, diffrax, diffrax_symplectic as ds
-import lineax as lx
-jax.config.update("jax_enable_x64", True)
-n = 20
-H0 = lambda t, p, q, args: p @ p / 2 + jnp.sum(q**4)
-solver = ds.BAOAB()
-def friction(t, q, args):
-    return lx.MatrixLinearOperator(args, lx.positive_semidefinite_tag)
-terms = ds.langevin_terms(H0, friction, 1.0, solver.path((n,), jr.key(0)))
-def solve(y0, friction):
-    return diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0, friction).ys
-y0 = jnp.ones(n), jnp.ones(n)
-program = jax.jit(solve).lower(y0, jnp.eye(n) + 0.1).compile().as_text()
-before, entry = program.split("ENTRY")
-print("lapack" in entry, "lapack" in before)
-"""
+    for friction in (FULL, jnp.eye(N)):
+        grad, exact, jacobian, exact_too = jax.jit(derivatives)(1.2, friction)
+        np.testing.assert_allclose(grad, exact, rtol=1e-12)
+        np.testing.assert_allclose(jacobian, exact_too, rtol=1e-12)
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="LAPACK serves CPUs")
+@pytest.mark.skipif(not OPTIMIZED, reason="The suite leaves this optimization out")
+@pytest.mark.core
 @pytest.mark.slow
 def test_a_constant_matrix_is_diagonalized_once_before_the_loop_over_steps():
-    # As users compile it: the suite leaves this optimization out.
-    left_out = ("XLA_FLAGS", "JAX_DISABLE_MOST_OPTIMIZATIONS")
-    env = {name: value for name, value in os.environ.items() if name not in left_out}
-    command = [sys.executable, "-c", _PROGRAM]
-    done = subprocess.run(command, capture_output=True, text=True, env=env)
-    assert done.stdout.split() == ["True", "False"], done.stderr
+    solver = ds.BAOAB()
+    friction = lambda t, q, args: as_friction(args)
+    path = solver.path((N,), jax.random.key(0))
+    terms = ds.langevin_terms(H0, friction, 1.0, path)
+
+    @jax.jit
+    def solve(y0, friction):
+        return diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0, friction).ys
+
+    program = solve.lower((P, Q), FULL).compile().as_text()
+    before, entry = program.split("ENTRY")
+    assert "lapack" in entry and "lapack" not in before

@@ -106,9 +106,18 @@ def whole(terms, solver):
     return diffrax.MultiTerm(*terms.terms, left_out)
 
 
-def kind_of(solver) -> tuple:
-    """Solvers of one kind have one reference."""
-    return solver.structure, has_friction(solver), isinstance(solver, ds.LinearFlow)
+def once_for_each_kind(make):
+    """`make(solver)`, once for all solvers whose systems are the same."""
+    made = {}
+
+    def of(solver):
+        is_split = isinstance(solver, ds.LinearFlow)
+        kind = solver.structure, has_friction(solver), is_split
+        if kind not in made:
+            made[kind] = make(solver)
+        return made[kind]
+
+    return of
 
 
 def take_step(solver, terms, t0, t1, y0, args):
@@ -120,14 +129,6 @@ def take_step(solver, terms, t0, t1, y0, args):
     return y1, result
 
 
-# One for each kind of step. Others are of the same blocks with other numbers, which
-# `test_tableau` knows; implicit ones of separable systems are in `test_separable`.
-OF_EACH_KIND = (
-    *(ds.ImplicitMidpoint(), ds.SRKw2(), ds.StormerVerlet(), ds.SRKs4()),
-    *(ds.NinomiyaVictoir(), ds.LevyAreaMidpoint(), ds.BAOAB(), SPLIT[-1]),
-)
-QUICK_STEPS = [*map(repr, OF_EACH_KIND)]
-
 # By the scope all tests of one solver follow each other, in the process that has compiled
 # its program.
 each = lambda solvers: pytest.mark.parametrize(
@@ -136,6 +137,9 @@ each = lambda solvers: pytest.mark.parametrize(
 # Optimized, a step with its derivative takes ten seconds to compile. So the core has one
 # solver for each kind of step: one system of equations, several, none, and flows.
 CORE = "ImplicitMidpoint()", "SRKw2()", "StormerVerlet()", "NinomiyaVictoir()"
+# One for each kind of step. Others are of the same blocks with other numbers, which
+# `test_tableau` knows; of implicit ones of separable systems the strong order is measured.
+QUICK_STEPS = [*CORE, *map(repr, (ds.LevyAreaMidpoint(), ds.BAOAB(), SPLIT[-1]))]
 
 
 def marked(solvers, quick, core=()):
@@ -225,41 +229,40 @@ def program(solver, dtype, derivatives: bool):
 
 @each(marked(STEPS, QUICK_STEPS, CORE))
 def test_steps_of_a_thousand_random_systems_are_symplectic(solver):
-    _assert_symplectic(solver, jnp.float64, 1e-13)
-
-
-@each(marked([s for s in DEFAULTS if repr(s) in CORE[:3]], CORE[2:3], CORE[:1]))
-def test_steps_in_single_precision_are_symplectic(solver):
-    _assert_symplectic(solver, jnp.float32, 5e-6)
-
-
-@each(marked([*DEFAULTS, *SPLIT], (CORE[0], CORE[2], "BAOAB()")))
-def test_steps_in_single_precision_are_those_in_double_precision(solver):
-    # Which are symplectic. Their derivatives are more than half of a program.
-    x = batch(solver.structure, jnp.float32)
-    y1, _, success = program(solver, jnp.float32, repr(solver) in CORE[:3])(x)
-    assert y1.dtype == jnp.float32
-    assert np.all(success)
-    doubled = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), x)
-    exact, _, _ = program(solver, jnp.float64, True)(doubled)
-    size = np.max(np.abs(exact), axis=1, keepdims=True)
-    # Of `ImplicitMidpoint` 6.5e-7 are measured, six units in the last place.
-    assert np.max(np.abs(y1 - exact) / size) <= 1.5e-6
-
-
-def _assert_symplectic(solver, dtype, bound):
-    y1, jacobian, success = program(solver, dtype, True)(batch(solver.structure, dtype))
-    assert y1.dtype == jacobian.dtype == dtype
+    x = batch(solver.structure, jnp.float64)
+    y1, jacobian, success = program(solver, jnp.float64, True)(x)
+    assert y1.dtype == jacobian.dtype == jnp.float64
     assert np.all(success)
     J = np.asarray(jacobian[:, :, : 2 * D])
     zero, one = np.zeros((D, D)), np.eye(D)
-    omega = np.block([[zero, one], [-one, zero]]).astype(dtype)
+    omega = np.block([[zero, one], [-one, zero]])
     shrunk = 1.0
     if has_friction(solver):
-        h = np.asarray(batch(solver.structure, dtype).h)
-        shrunk = area_factor(solver, GAMMA * h)[:, None, None]
+        shrunk = area_factor(solver, GAMMA * np.asarray(x.h))[:, None, None]
     defects = np.swapaxes(J, 1, 2) @ omega @ J - shrunk * omega
-    assert np.max(np.abs(defects)) <= bound
+    assert np.max(np.abs(defects)) <= 1e-13
+
+
+@each(marked([*DEFAULTS, *SPLIT], (CORE[0], CORE[2], "BAOAB()"), CORE[:1]))
+def test_steps_in_single_precision_are_those_in_double_precision(solver):
+    # Which are symplectic. Derivatives are more than half of a program.
+    with_derivatives = OPTIMIZED or repr(solver) in CORE[1:3]
+    x = batch(solver.structure, jnp.float32)
+    y1, jacobian, success = program(solver, jnp.float32, with_derivatives)(x)
+    assert np.all(success)
+    doubled = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), x)
+    exact, exact_jacobian, _ = program(solver, jnp.float64, True)(doubled)
+
+    def assert_close(single, double, bound):
+        assert single.dtype == jnp.float32
+        size = np.max(np.abs(double), axis=1, keepdims=True)
+        assert np.max(np.abs(single - double) / size) <= bound
+
+    # Of `ImplicitMidpoint` 6.5e-7 are measured, six units in the last place.
+    assert_close(y1, exact, 1.5e-6)
+    if with_derivatives:
+        flat = lambda x: np.reshape(x, (N, -1))
+        assert_close(flat(jacobian), flat(exact_jacobian), 5e-6)
 
 
 def _some(x: Batch, number: int) -> Batch:
@@ -300,17 +303,9 @@ def test_failures_are_reported_and_leave_others_as_they_are(solver):
         np.testing.assert_allclose(a[whole], b[whole], rtol=1e-12, atol=1e-13)
 
 
-_FLOWS = {}
-
-
+@once_for_each_kind
 def _flows(solver) -> jax.Array:
     """Exact flows of the drift over 0.1 and over 0.05."""
-    if kind_of(solver) not in _FLOWS:
-        _FLOWS[kind_of(solver)] = _make_flows(solver)
-    return _FLOWS[kind_of(solver)]
-
-
-def _make_flows(solver) -> jax.Array:
     x = batch(solver.structure, jnp.float64)
 
     @jax.jit
@@ -364,18 +359,10 @@ def _kinds(structure: str) -> dict[str, bool]:
     return KINDS if structure == "any" else {"one": True, "commuting": True}
 
 
-_WEAK = {}
-
-
+@once_for_each_kind
 def _weak_systems(solver):
     """Two systems of each kind, with two noises; and the means of exact steps, but for
     terms beyond the third or fourth order of the step."""
-    if kind_of(solver) not in _WEAK:
-        _WEAK[kind_of(solver)] = _make_weak_systems(solver)
-    return _WEAK[kind_of(solver)]
-
-
-def _make_weak_systems(solver):
     order = 3 if solver.structure == "constant" else 2
     system = SYSTEMS[solver.structure]
     keys = jr.split(jr.key(4), 2)
@@ -402,36 +389,27 @@ def _make_weak_systems(solver):
     return y0, args, np.asarray(over_steps(exact, _WEAK_STEPS, y0, args))
 
 
-def local_weak_orders(solver) -> dict[str, float]:
+# The outcomes of Lévy areas cannot be enumerated. Quick tests know the order of tableaus by
+# its conditions, and the flows of `NinomiyaVictoir` one by one.
+@pytest.mark.slow
+@each([s for s in TABLE if "A" not in s.variables])
+def test_local_weak_order(solver):
     y0, args, exact = _weak_systems(solver)
     path = solver.path((2,), jr.key(0), want="weak")
     terms = terms_for(solver, path, commuting=True)
-    solver = by_picard(solver)
+    quick = by_picard(solver)
 
     def mean(h, y0, args):
         # Gaussian variables by quadrature.
         kwargs = dict(fn=values_of_a_step, nodes=4)
-        return ds.step_expectation(terms, solver, 0.1, 0.1 + h, y0, args, **kwargs)
+        return ds.step_expectation(terms, quick, 0.1, 0.1 + h, y0, args, **kwargs)
 
-    means = over_steps(mean, _WEAK_STEPS, y0, args, one_after_another)
-    defects = np.asarray(means) - exact
-    sizes = lambda i: np.linalg.norm(defects[2 * i : 2 * i + 2], axis=(0, 2))
-    kinds = _kinds(solver.structure)
-    return {kind: slope(_WEAK_STEPS, sizes(i)) - 1 for i, kind in enumerate(kinds)}
-
-
-# The outcomes of Lévy areas cannot be enumerated. Quick tests know the order of tableaus by
-# its conditions.
-@each(marked([s for s in TABLE if "A" not in s.variables], CORE[2:]))
-def test_local_weak_order(solver):
-    for kind, order in local_weak_orders(solver).items():
+    defects = over_steps(mean, _WEAK_STEPS, y0, args, one_after_another) - exact
+    for i, kind in enumerate(_kinds(solver.structure)):
+        sizes = np.linalg.norm(defects[2 * i : 2 * i + 2], axis=(0, 2))
+        order = slope(_WEAK_STEPS, sizes) - 1
         claim = solver.record.order("weak", KINDS[kind])
         assert abs(order - claim) <= 0.1, (kind, order)
-    system = SYSTEMS[solver.structure]
-    for m in (1, 2):
-        terms = system.terms(solver.path((m,), jr.key(0)))
-        # A solver does not know whether several noises commute.
-        assert solver.weak_order(terms) == solver.record.order("weak", m == 1)
 
 
 _STRONG_STEPS = np.array([16, 32, 64])
@@ -439,8 +417,8 @@ _STRONG_STEPS = np.array([16, 32, 64])
 _STRONG_PATHS = 240
 
 
-def strong_orders(solver) -> dict[str, tuple[float, float]]:
-    """Slopes of root mean squares over common paths, and their standard errors."""
+def squared_errors(solver) -> np.ndarray:
+    """Those of states after so many steps, by kind of noise and path, over common paths."""
     system, m = SYSTEMS[solver.structure], 2
     fine = 2**8 if "L" in solver.variables else 2**9
     # The errors that are measured are larger than 1e-6.
@@ -475,15 +453,7 @@ def strong_orders(solver) -> dict[str, tuple[float, float]]:
         over(keys, *batch, n).reshape(number, _STRONG_PATHS, -1)
         for n in np.array([*_STRONG_STEPS, fine])
     )
-    squares = np.sum((np.stack(coarse) - exact) ** 2, axis=-1)
-    means = np.mean(squares, axis=-1, keepdims=True)
-    # A slope is a sum over logarithms of errors, and so, to first order, over paths.
-    x = -np.log(_STRONG_STEPS)
-    weights = (x - x.mean()) / np.sum((x - x.mean()) ** 2) / 2
-    orders = np.einsum("i,ik->k", weights, np.log(means[..., 0]))
-    parts = np.einsum("i,ikn->kn", weights, squares / means)
-    bars = np.std(parts, axis=-1) / np.sqrt(_STRONG_PATHS)
-    return dict(zip(kinds, zip(orders.tolist(), bars.tolist())))
+    return np.sum((np.stack(coarse) - exact) ** 2, axis=-1)
 
 
 STRONG = [
@@ -493,19 +463,24 @@ STRONG = [
 ]
 
 
-# Of the orders 1 and 3/2.
-QUICK_STRONG = "StormerVerlet()", "SRKs4()"
-
-
 # How far slopes of steps that are not yet small lie above the claim, where terms of higher
 # order are still seen. For noises of order 1/2 it tells this order from 1. Of
 # `SRKs4(0.3, -0.7)`, of order 3/2, 2.0 is measured down to steps of 1 / 128.
 _ABOVE = {1 / 2: 0.2, 1: 0.3, 3 / 2: 0.5}
 
 
-@each(marked(STRONG, QUICK_STRONG))
+# The order 1 of `StormerVerlet` is measured by `test_compare`, too.
+@each(marked(STRONG, ["SRKs4()"]))
 def test_strong_order(solver):
-    for kind, (order, bar) in strong_orders(solver).items():
+    squares = squared_errors(solver)
+    means = np.mean(squares, axis=-1, keepdims=True)
+    # A slope is a sum over logarithms of errors, and so, to first order, over paths.
+    x = -np.log(_STRONG_STEPS)
+    weights = (x - x.mean()) / np.sum((x - x.mean()) ** 2) / 2
+    orders = np.einsum("i,ik->k", weights, np.log(means[..., 0]))
+    parts = np.einsum("i,ikn->kn", weights, squares / means)
+    bars = np.std(parts, axis=-1) / np.sqrt(_STRONG_PATHS)
+    for kind, order, bar in zip(_kinds(solver.structure), orders, bars):
         claim = solver.record.order("strong", KINDS[kind])
         # With wider bars a slope of 1/2 would pass for the claim 1, of which 0.9 - 3 * 0.1
         # is the least that passes.
@@ -517,27 +492,15 @@ def test_strong_order(solver):
 
 @pytest.mark.slow
 def test_the_default_sign_of_srks4_has_the_smaller_strong_error():
-    # On other systems the two come closer to each other.
-    system, fine = SYSTEMS["constant"], 2**9
-    y0, args = system.draw(jr.key(8), 1, 2, jnp.float64)
-
-    def errors(solver):
-        @jax.jit
-        @ft.partial(jax.vmap, in_axes=(0, None))
-        def end(key, steps):
-            terms, h = system.terms(FineSample.draw(key, fine, 2)), 1 / steps
-            step = lambda i, y: take_step(solver, terms, i * h, (i + 1) * h, y, args)[0]
-            return jnp.stack(jax.lax.fori_loop(0, steps, step, y0))
-
-        keys = jr.split(jr.key(0), 200)
-        *coarse, exact = (end(keys, n) for n in np.array([8, 16, 32, 64, fine]))
-        return np.sum((np.stack(coarse) - exact) ** 2, axis=(1, 2, 3))
-
-    assert np.all(errors(ds.SRKs4()) < errors(ds.SRKs4(sign=1)))
+    gain = squared_errors(ds.SRKs4(sign=1)) - squared_errors(ds.SRKs4())
+    bar = np.std(gain, axis=-1) / np.sqrt(_STRONG_PATHS)
+    # Of shorter steps both have smaller errors.
+    assert np.all(np.mean(gain, axis=-1)[0] > 3 * bar[0])
+    assert np.all(np.mean(gain, axis=-1) > 0)
 
 
 @each([*DEFAULTS, *SPLIT])
-def test_own_paths_hold_what_a_step_needs(solver):
+def test_own_paths_hold_what_a_step_needs_and_others_are_refused(solver):
     system = SYSTEMS[solver.structure]
     y0, args = system.draw(jr.key(0), 1, 2, jnp.float64)
     # The test of weak orders takes a step along the other path.
@@ -553,29 +516,22 @@ def test_own_paths_hold_what_a_step_needs(solver):
     meant = "weak" if solver.record.strong is None else "strong"
     default, asked = (solver.path((2,), jr.key(0), want=w) for w in (None, meant))
     assert eqx.tree_equal(default, asked)
-
-
-@each(DEFAULTS)
-def test_a_path_without_what_a_step_needs_is_refused_with_advice(solver):
-    if solver.variables == ("W",):
-        return
-    y0, args = SYSTEMS[solver.structure].draw(jr.key(0), 1, 2, jnp.float64)
-    plain = ds.FixedStepBrownianPath((2,), jr.key(0))
-    terms = SYSTEMS[solver.structure].terms(plain)
     name = type(solver).__name__
-    needed = most_demanding_variable(solver.variables)
+    if solver.structure != "any" and not isinstance(solver, ds.LinearFlow):
+        # Systems of another structure are refused.
+        system = SYSTEMS["any"]
+        other = system.draw(jr.key(0), 1, 2, jnp.float64)
+        with pytest.raises(ValueError, match=f"`{name}` needs"):
+            solver.init(system.terms(path), 0.0, 0.1, *other)
+    # A path with less is refused with advice.
+    terms = terms_for(solver, ds.FixedStepBrownianPath((2,), jr.key(0)))
+    if solver.variables == ("W",) or has_friction(solver):
+        return
     with pytest.raises(ValueError, match=f"`{name}` needs") as info:
         solver.step(terms, 0.0, 0.1, y0, args, None, False)
     assert "by `solver.path(shape, key)`." in str(info.value)
+    needed = most_demanding_variable(solver.variables)
     assert needed.name in str(info.value) or name == "NinomiyaVictoir"
-
-
-@each([s for s in [*DEFAULTS, *SPLIT[: len(LANGEVIN)]] if s.structure != "any"])
-def test_systems_of_another_structure_are_refused(solver):
-    y0, args = SYSTEMS["any"].draw(jr.key(0), 1, 2, jnp.float64)
-    terms = SYSTEMS["any"].terms(ds.WeakBrownianPath((2,), jr.key(0)))
-    with pytest.raises(ValueError, match=f"`{type(solver).__name__}` needs"):
-        solver.init(terms, 0.0, 0.1, y0, args)
 
 
 def test_bad_shapes_keys_and_wants_are_refused():
@@ -600,10 +556,17 @@ def test_solvers_say_what_they_need():
             assert kind().minimal_levy_area is increment
     for solver in DEFAULTS:
         if hasattr(solver, "tableau"):
+            is_implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+            assert is_implicit == (len(solver.stage_vectors(5)) > 0)
             # The unknown vectors of each system of equations.
             blocks = make_plan(solver.tableau.flatten()).blocks
             sizes = (sum(map(len, block.unknown)) for block in blocks)
             assert solver.stage_vectors(5) == tuple(n for n in sizes if n)
+    for solver in TABLE:
+        for m in (1, 2):
+            terms = terms_for(solver, solver.path((m,), jr.key(0)))
+            # A solver does not know whether several noises commute.
+            assert solver.weak_order(terms) == solver.record.order("weak", m == 1)
 
 
 def test_solvers_print_in_a_line():

@@ -11,7 +11,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._adjoint import _undoes_its_steps
 from diffrax_symplectic._solver import LANGEVIN
 
-from ..problems import Given, orders_of_a_splitting, weak_path
+from ..problems import Given, one_step, weak_path
 
 
 def _rest(t, p, q, args):
@@ -22,24 +22,19 @@ def _kicks(t, p, q, args):
     return jnp.stack([0.5 * jnp.sum(jnp.sin(q)), 0.3 * jnp.sum(q**2)])
 
 
-def waves(n: int, dx: float):
-    """The exact flow of H0 = sum p_j^2 / 2 + (q_(j+1) - q_j)^2 / (2 dx^2) + q_j^2 / 2 on a
-    ring, by Fourier transforms."""
-    k = 2 * np.pi * np.arange(n // 2 + 1) / n
-    w = np.sqrt(1 + (2 * np.sin(k / 2) / dx) ** 2)
+def modes(omega):
+    """The exact flow of H0 = sum_k (p_k^2 + omega_k^2 q_k^2) / 2, without a case for the
+    frequency zero."""
 
     def flow(time, y, args):
-        P, Q = map(jnp.fft.rfft, y)
-        c, s = jnp.cos(w * time), jnp.sin(w * time)
-        back = lambda x: jnp.fft.irfft(x, n)
-        return back(c * P - w * s * Q), back(c * Q + s / w * P)
+        p, q = y
+        c, s = jnp.cos(omega * time), jnp.sin(omega * time)
+        return c * p - omega * s * q, c * q + s / omega * p
 
     return flow
 
 
-def _one_step(solver, terms, h, y0, t0=0.1):
-    state = solver.init(terms, t0, t0 + h, y0, None)
-    return solver.step(terms, t0, t0 + h, y0, None, state, False)[0]
+FLOW = modes(jnp.arange(1.0, 9.0))
 
 
 class _Own(ds.AbstractSymplecticSolver):
@@ -63,7 +58,7 @@ class _Own(ds.AbstractSymplecticSolver):
 def test_orders_are_those_of_the_splitting_where_the_solver_has_higher_ones():
     one_noise = lambda *a: _kicks(*a)[:1]
     terms = ds.hamiltonian_terms(_rest, one_noise, weak_path(1))
-    wrap = lambda solver: ds.LinearFlow(solver, waves(8, 0.1))
+    wrap = lambda solver: ds.LinearFlow(solver, FLOW)
     orders = lambda solver: [
         getattr(wrap(solver), name)(terms)
         for name in ("order", "weak_order", "strong_order")
@@ -76,101 +71,92 @@ def test_orders_are_those_of_the_splitting_where_the_solver_has_higher_ones():
     assert orders(ds.SRKs1()) == [2, 1, 1.0]
     assert orders(_Own()) == [2, 1, 0.5]
     assert orders(ds.SRKw2())[1:] == [2, None]
-
-
-@pytest.mark.slow
-def test_noises_that_do_not_commute_leave_the_splitting_at_weak_order_two():
-    # Neither with each other nor with the flow.
-    def noise(t, p, q, args):
-        return jnp.stack([0.3 * jnp.sum(p * q), 0.15 * jnp.sum(q**2 - p**2)])
-
-    flow = waves(2, 1.0)
-    wave = lambda t, y, args: jax.jvp(lambda s: flow(s, y, args), (0.0,), (1.0,))[1]
-    terms = ds.hamiltonian_terms(_rest, noise, weak_path(2, two_point=True))
-    solver = ds.LinearFlow(ds.NinomiyaVictoir(), flow)
-    y0 = jnp.array([0.3, -0.4]), jnp.array([0.5, 0.1])
-    # The frequencies are 1 and 2.2.
-    hs = np.array([0.02, 0.01, 0.005])
-    slopes = orders_of_a_splitting(solver, terms, wave, y0, hs)
-    np.testing.assert_allclose(slopes, 3.0, atol=0.1)
+    # It is implicit if its solver is.
+    implicit, explicit = wrap(ds.ImplicitMidpoint()), wrap(ds.StormerVerlet())
+    assert isinstance(implicit, diffrax.AbstractImplicitSolver)
+    assert not isinstance(explicit, diffrax.AbstractImplicitSolver)
 
 
 def test_linear_systems_without_a_rest_are_solved_exactly():
-    flow, y0 = waves(16, 0.1), tuple(jr.normal(jr.key(0), (2, 16)))
+    y0 = tuple(jr.normal(jr.key(0), (2, 8)))
     nothing = lambda t, p, q, args: 0 * jnp.sum(q)
     terms = ds.hamiltonian_terms(nothing, nothing, Given(jnp.zeros(())))
-    solver = ds.LinearFlow(ds.StormerVerlet(), flow)
+    solver = ds.LinearFlow(ds.StormerVerlet(), FLOW)
+
+    @jax.jit
+    def solved_and_exact(end):
+        at = terms, solver, 0.0, end, end / 7, y0
+        sol = diffrax.diffeqsolve(*at, max_steps=8)
+        return [x[-1] for x in sol.ys], FLOW(end, y0, None)
+
     for end in (5.0, -5.0):
-        sol = diffrax.diffeqsolve(terms, solver, 0, end, end / 7, y0, max_steps=8)
-        np.testing.assert_allclose(
-            [x[-1] for x in sol.ys], flow(end, y0, None), atol=1e-12
-        )
+        np.testing.assert_allclose(*solved_and_exact(end), atol=1e-12)
 
 
 def test_what_a_solver_remembers_is_not_taken_for_where_the_flow_leads():
     # The solver keeps the end of its step, and the flow goes on from there.
-    flow = waves(8, 0.5)
     terms = ds.hamiltonian_terms(_rest)
     inner, y = _Own(), tuple(jr.normal(jr.key(0), (2, 8)))
-    solver = ds.LinearFlow(inner, flow)
-    sol = diffrax.diffeqsolve(terms, solver, 0, 0.6, 0.2, y, max_steps=4)
+    sol = diffrax.diffeqsolve(
+        terms, ds.LinearFlow(inner, FLOW), 0, 0.6, 0.2, y, max_steps=4
+    )
+
+    @jax.jit
+    def split_step(t, y):
+        return FLOW(0.1, one_step(inner, terms, 0.2, FLOW(0.1, y, None), t), None)
+
     for i in range(3):
-        y = flow(0.1, y, None)
-        y = _one_step(inner, terms, 0.2, y, 0.2 * i)
-        y = flow(0.1, y, None)
+        y = split_step(0.2 * i, y)
     np.testing.assert_allclose([x[-1] for x in sol.ys], y, atol=1e-13)
 
 
 @pytest.mark.core
 def test_steps_of_a_reversible_solver_are_undone():
-    solver = ds.LinearFlow(ds.StormerVerlet(), waves(8, 0.1))
+    solver = ds.LinearFlow(ds.StormerVerlet(), FLOW)
     assert _undoes_its_steps(solver)
     terms, y0 = ds.hamiltonian_terms(_rest), tuple(jr.normal(jr.key(0), (2, 8)))
-    there = _one_step(solver, terms, 0.2, y0, 0.1)
-    back = _one_step(solver, terms, -0.2, there, 0.3)
+    there = one_step(solver, terms, 0.2, y0, 0.1)
+    back = one_step(solver, terms, -0.2, there, 0.3)
     np.testing.assert_allclose(back, y0, atol=1e-13)
-    assert not _undoes_its_steps(ds.LinearFlow(ds.SRKw4(), waves(8, 0.1)))
+    assert not _undoes_its_steps(ds.LinearFlow(ds.SRKw4(), FLOW))
 
 
 def test_flows_that_are_none_are_refused():
     terms = ds.hamiltonian_terms(_rest, _kicks, weak_path(2))
     y0 = jnp.ones(8), jnp.ones(8)
-    inner, flow = ds.StormerVerlet(), waves(8, 0.1)
+    inner = ds.StormerVerlet()
     with pytest.raises(ValueError, match=r"called as `flow\(time, y, args\)`"):
         ds.LinearFlow(inner, lambda y: y)  # pyright: ignore
     # Diffrax's wrappers count as what they wrap, by `isinstance`.
     for other in (diffrax.Heun(), diffrax.HalfSolver(ds.ImplicitMidpoint())):
         with pytest.raises(ValueError, match="wraps a solver of this package"):
-            ds.LinearFlow(other, flow)
+            ds.LinearFlow(other, FLOW)
     init = lambda flow, y0=y0: ds.LinearFlow(inner, flow).init(
         terms, 0.0, 0.1, y0, None
     )
     with pytest.raises(ValueError, match="must return a pair like the state"):
         init(lambda time, y, args: (y[0], y[1][:4]))
     with pytest.raises(ValueError, match="is a pair"):
-        init(flow, jnp.ones(8))
+        init(FLOW, jnp.ones(8))
+    # The flow would follow what the solver follows, too.
+    slow = lambda t, q, args: _rest(t, q, q, args)
+    whole = ds.hamiltonian_terms(lambda t, p, q, args: p @ p, slow=slow)
+    with pytest.raises(ValueError, match="contain the rest alone"):
+        ds.LinearFlow(inner, FLOW).init(whole, 0.0, 0.1, y0, None)
     # One propagator for all steps.
     with pytest.raises(ValueError, match="does not depend on `time`"):
-        init(lambda time, y, args: flow(0.05, y, args))
-
-
-def test_it_is_implicit_if_its_solver_is():
-    flow = waves(8, 0.1)
-    implicit = ds.LinearFlow(ds.ImplicitMidpoint(), flow)
-    explicit = ds.LinearFlow(ds.StormerVerlet(), flow)
-    assert isinstance(implicit, diffrax.AbstractImplicitSolver)
-    assert not isinstance(explicit, diffrax.AbstractImplicitSolver)
+        init(lambda time, y, args: FLOW(0.05, y, args))
 
 
 BATH = r"`BAOAB\(linear_flow\(\.\.\.\)\)`.*`langevin_terms\(.*slow="
 
 
 def test_heat_baths_are_refused_in_favour_of_baoab():
-    flow, y0 = waves(8, 0.1), (jnp.ones(8), jnp.ones(8))
+    y0 = jnp.ones(8), jnp.ones(8)
     baths = [*(kind() for kind in LANGEVIN), ds.BAOAB(ds.StormerVerlet())]
     for langevin in baths:
         with pytest.raises(ValueError, match=BATH):
-            ds.LinearFlow(langevin, flow)
+            ds.LinearFlow(langevin, FLOW)
     kinetic = lambda t, p, q, args: jnp.sum(p**2) / 2
     path = ds.WeakBrownianPath((8,), jr.key(0))
     bath = ds.bath_terms(kinetic, 0.5, 1.0, path).terms
@@ -185,51 +171,26 @@ def test_heat_baths_are_refused_in_favour_of_baoab():
         ),
     ):
         for inner in (ds.StormerVerlet(), ds.ImplicitMidpoint()):
-            solver = ds.LinearFlow(inner, flow)
             with pytest.raises(ValueError, match=f"no terms with friction.*{BATH}"):
-                diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0)
+                ds.LinearFlow(inner, FLOW).init(terms, 0.0, 0.1, y0, None)
 
 
-def test_terms_of_the_whole_energy_with_a_slow_part_are_refused():
-    # The flow would follow what the solver follows, too.
-    whole = lambda t, p, q, args: jnp.sum(p**2 + q**2) / 2
-    slow = lambda t, q, args: _rest(t, q, q, args)
-    solver = ds.LinearFlow(ds.StormerVerlet(), waves(8, 0.1))
-    terms = ds.hamiltonian_terms(whole, slow=slow)
-    with pytest.raises(ValueError, match="contain the rest alone"):
-        solver.init(terms, 0.0, 0.1, (jnp.ones(8), jnp.ones(8)), None)
-
-
-def _drifting(omega):
-    """The flow of a mode, without a case for frequency zero."""
-
-    def flow(time, y, args):
-        p, q = y
-        c, s = jnp.cos(omega * time), jnp.sin(omega * time)
-        return c * p - omega * s * q, c * q + s / omega * p
-
-    return flow
-
-
-def test_a_flow_that_returns_nan_is_named():
+def test_a_flow_that_returns_nan_is_named_and_in_a_batch_fails_its_path_alone():
     y0 = jnp.ones(2), jnp.ones(2)
     terms = ds.hamiltonian_terms(_rest)
     named = r"`flow\(time, y, args\)` returned NaN.*jnp.sinc"
-    solver = ds.LinearFlow(ds.StormerVerlet(), _drifting(jnp.array([1.0, 0.0])))
+    solver = ds.LinearFlow(ds.StormerVerlet(), modes(jnp.array([1.0, 0.0])))
     with pytest.raises(ValueError, match=named):
         solver.init(terms, 0.0, 0.1, y0, None)
     # Also from within a program.
     with pytest.raises(Exception, match=named):
         jax.jit(lambda y0: solver.init(terms, 0.0, 0.1, y0, None))(y0)
 
-
-def test_in_a_batch_a_flow_that_returns_nan_fails_its_path_alone():
-    terms, y0 = ds.hamiltonian_terms(_rest), (jnp.ones(()), jnp.ones(()))
-
     @jax.jit
     @jax.vmap
     def run(omega):
-        solver = ds.LinearFlow(ds.ImplicitMidpoint(), _drifting(omega))
+        solver = ds.LinearFlow(ds.StormerVerlet(), modes(omega))
+        y0 = jnp.ones(()), jnp.ones(())
         sol = diffrax.diffeqsolve(terms, solver, 0.0, 1.0, 0.1, y0, throw=False)
         return sol.result == diffrax.RESULTS.nonfinite, sol.ys[1][-1]
 

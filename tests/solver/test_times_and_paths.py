@@ -52,6 +52,8 @@ def _single(solver):
 @each
 def test_steps_that_single_precision_does_not_resolve_fail(solver):
     # At 58,000 a solve of a hundred steps had 62, and at a million nearly all had length 0.
+    # 100 roundings are 100 eps t: steps of 0.01 are too short beyond 839, and those that
+    # are rounded down a little before.
     path = _single(solver)
 
     @jax.jit
@@ -65,36 +67,24 @@ def test_steps_that_single_precision_does_not_resolve_fail(solver):
         (1e6, 1e6 + 100, 0.01),
         (58e3, 58001, 0.01),
         (-1e4, -9999, 1e-2),
+        (820.0, 1000.0, 0.01),
         (58e3, 58000, -0.01),
+        (820.0, 829.0, 0.01),
     ]
     success, too_short, num_steps = run(*jnp.array(cases, jnp.float32).T)
-    np.testing.assert_array_equal(too_short, [True, True, True, False])
-    np.testing.assert_array_equal(success, [False, False, False, True])
+    np.testing.assert_array_equal(too_short, [True] * 4 + [False] * 2)
+    np.testing.assert_array_equal(success, ~too_short)
     np.testing.assert_array_equal(num_steps[:3], 1)
+    assert 830 < 820 + num_steps[3] * 0.01 < 839
 
 
-def test_the_error_comes_where_the_times_become_too_coarse():
+def test_too_short_steps_raise_the_message_of_the_faq_and_double_precision_resolves_them():
     solver = ds.StormerVerlet()
-    path = _single(solver)
-    # The FAQ has this message.
+    solve = lambda path, dtype: _solve(solver, path, 1e6, 1e6 + 0.1, 0.01, dtype)
     with pytest.raises(eqx.EquinoxRuntimeError, match="minimum step size was reached"):
-        _solve(solver, path, 1e6, 1e6 + 100, 0.01, jnp.float32)
-    # 100 roundings are 100 eps t: steps of 0.01 are too short beyond 839, and those that
-    # are rounded down a little before.
-    saveat = diffrax.SaveAt(t1=True)
-    options = dict(throw=False, saveat=saveat)
-
-    @jax.jit
-    def run(t1):
-        return _solve(solver, path, 0.0, t1, 0.01, jnp.float32, **options)
-
-    assert run(800.0).result == diffrax.RESULTS.successful
-    late = run(1000.0)
-    assert late.result == TOO_SHORT
-    assert 830 < late.stats["num_steps"] * 0.01 < 839
-    # Double precision resolves them.
-    double = _solve(solver, solver.path((), jr.key(0)), 1e6, 1e6 + 0.1, 0.01)
-    assert double.stats["num_steps"] == 10
+        solve(_single(solver), jnp.float32)
+    path = solver.path((), jr.key(0))
+    assert solve(path, jnp.float64).stats["num_steps"] == 10
 
 
 class Recorded(diffrax.AbstractBrownianPath):
@@ -138,19 +128,15 @@ def test_beyond_the_end_of_recorded_noise_there_is_an_error(solver):
             jax.block_until_ready(run(jnp.array(t0), jnp.array(t1)))
 
 
-@pytest.mark.parametrize(
-    "solver, missing", [(ds.PlateauVerlet(), "plateaus"), (ds.PlateauGauss(), "Lévy")]
-)
-def test_recorded_noise_leads_to_solvers_that_need_only_increments(solver, missing):
-    says = f"needs .*{missing}.*but `Recorded` has no random key.* `StormerVerlet`"
-    with pytest.raises(ValueError, match=says):
-        _solve(solver, RECORD, 0.0, 1.0, 0.1)
-    # Random noise is drawn with more instead.
-    random = ds.WeakBrownianPath((), jr.key(0))
-    with pytest.raises(ValueError, match=rf"needs .*{missing}.*`solver.path\(shape"):
-        _solve(solver, random, 0.0, 1.0, 0.1)
-    with pytest.raises(ValueError, match=r"by `solver.path\(shape"):
-        ds.second_moment_map(_oscillator(random), solver, 0.0, 0.1, (0.0, 1.0))
+def test_recorded_noise_leads_to_solvers_that_need_only_increments():
+    at = _oscillator(RECORD), 0.0, 0.1, (jnp.zeros(()), jnp.ones(())), None, None, False
+    for solver, missing in (
+        (ds.PlateauVerlet(), "plateaus"),
+        (ds.PlateauGauss(), "Lévy"),
+    ):
+        says = f"needs .*{missing}.*but `Recorded` has no random key.* `StormerVerlet`"
+        with pytest.raises(ValueError, match=says):
+            solver.step(*at)
 
 
 def test_suggestions_keep_recorded_noise():
@@ -191,37 +177,34 @@ def test_suggestions_tell_of_a_path_of_diffrax_that_repeats_its_noise():
     assert distinct(unsafe) < 5_000 and distinct(ours) == 10_000
 
 
-@pytest.mark.parametrize("operator", [True, False])
-def test_noises_that_do_not_fit_their_control_term_are_refused(operator):
-    solver = by_picard(ds.ImplicitMidpoint() if operator else ds.NinomiyaVictoir())
-
-    def field(t, y, args):
-        struct = jax.ShapeDtypeStruct((2,), jnp.float64)
-        kick = lambda w: 0.1 * w
-        return lx.FunctionLinearOperator(kick, struct) if operator else 0.1 * jnp.eye(2)
-
-    def terms(shape):
-        path = ds.WeakBrownianPath(shape, jr.key(0), two_point=True)
-        drift = diffrax.ODETerm(lambda t, y, args: -y)
-        return diffrax.MultiTerm(drift, diffrax.ControlTerm(field, path))
-
-    def solve(shape, y0):
-        given = terms(shape), solver, 0, 1, 0.5
-        solved = jax.jit(lambda y0: diffrax.diffeqsolve(*given, y0, max_steps=2).ys)
-        return solved(y0)
-
+def test_noises_that_do_not_fit_their_control_term_are_refused():
     single, y0 = jax.ShapeDtypeStruct((2,), jnp.float32), jnp.ones(2)
-    takes = "operator on" if operator else "array"
-    says = rf"vector field, .*{takes} f64\[2.*increments of its path, f{{}}\. Construct"
-    with pytest.raises(ValueError, match=says.format(r"64\[3\]")):
-        solve((3,), y0)
-    with pytest.raises(ValueError, match=says.format(r"64\[3\]")):
-        ds.suggest_solver(terms((3,)), 0, y0, want="weak")
-    with pytest.raises(ValueError, match="state|The terms change an array"):
-        solve((2,), jnp.ones(3))
-    if operator:
-        with pytest.raises(ValueError, match=says.format(r"32\[2\]")):
-            solve(single, y0)
-    else:
-        # Diffrax multiplies arrays of different precision.
-        np.testing.assert_allclose(solve(single, y0), solve((2,), y0), rtol=1e-6)
+    kick = lx.FunctionLinearOperator(lambda w: 0.1 * w, jnp.ones(2))
+    says = r"vector field, .*{} f64\[2.*increments of its path, f{}\. Construct"
+    for solver, matrix, takes in (
+        (by_picard(ds.ImplicitMidpoint()), kick, "operator on"),
+        (by_picard(ds.NinomiyaVictoir()), 0.1 * jnp.eye(2), "array"),
+    ):
+
+        def terms(shape, matrix=matrix):
+            path = ds.WeakBrownianPath(shape, jr.key(0), two_point=True)
+            drift = diffrax.ODETerm(lambda t, y, args: -y)
+            diffusion = diffrax.ControlTerm(lambda t, y, args: matrix, path)
+            return diffrax.MultiTerm(drift, diffusion)
+
+        def solve(shape, y0, solver=solver, terms=terms):
+            at = terms(shape), 0.0, 0.5, y0, None
+            return solver.step(*at, solver.init(*at), False)[0]
+
+        with pytest.raises(ValueError, match=says.format(takes, r"64\[3\]")):
+            solve((3,), y0)
+        with pytest.raises(ValueError, match=says.format(takes, r"64\[3\]")):
+            ds.suggest_solver(terms((3,)), 0, y0, want="weak")
+        with pytest.raises(ValueError, match="state|The terms change an array"):
+            solve((2,), jnp.ones(3))
+        if matrix is kick:
+            with pytest.raises(ValueError, match=says.format(takes, r"32\[2\]")):
+                solve(single, y0)
+        else:
+            # Diffrax multiplies arrays of different precision.
+            np.testing.assert_allclose(solve(single, y0), solve((2,), y0), rtol=1e-6)

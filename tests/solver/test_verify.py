@@ -1,5 +1,7 @@
 """Exact checks of one step: symplecticity, weak orders, moments."""
 
+import functools as ft
+
 import diffrax
 import jax
 import jax.numpy as jnp
@@ -10,86 +12,34 @@ import pytest
 import diffrax_symplectic as ds
 
 from ..families import slow_except
-from ..picard import by_picard
-from ..problems import (
-    Given,
-    H0,
-    kubo_terms,
-    local_weak_orders,
-    noise,
-    random_problem,
-    weak_path,
-)
+from ..problems import Given, kubo_terms, weak_path
 
 
-def test_weak_order_defect_sees_a_method_of_lower_order():
-    terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
-    y0, args = jax.vmap(lambda key: random_problem(key, 1, 1))(jr.split(jr.key(0), 4))
-    hs = np.array([0.02, 0.005])
-    solver = by_picard(ds.ImplicitMidpoint())
-    slopes = local_weak_orders(terms, solver, y0, args, hs, order=2)
-    assert np.median(slopes) < 2.5
-
-
-def test_weak_order_defect_knows_ito_from_stratonovich():
+def test_weak_order_defect_knows_ito_from_stratonovich_and_methods_of_lower_order():
     # dy = y dw: Euler's E[y^2] = (1 + h) y^2 is Itô's to first order.
-    path = weak_path(1)
     drift = diffrax.ODETerm(lambda t, y, args: jnp.zeros_like(y))
-    diffusion = diffrax.ControlTerm(lambda t, y, args: y[:, None], path)
-    terms = diffrax.MultiTerm(drift, diffusion)
-    kwargs = dict(fn=lambda t, y, args: y[0] ** 2, order=1)
-    y0 = jnp.array([1.0])
-    defect = ds.weak_order_defect(terms, diffrax.Euler(), 0.0, 0.1, y0, **kwargs)
-    np.testing.assert_allclose(defect, 0, atol=1e-15)
-    defect = ds.weak_order_defect(terms, diffrax.Heun(), 0.0, 0.1, y0, **kwargs)
-    # Heun: y1 = (1 + I + I^2 / 2) y, so E[y1^2] = 1 + 2 h + 3 h^2 / 4.
-    np.testing.assert_allclose(defect, 0.75 * 0.1**2, atol=1e-15)
+    diffusion = diffrax.ControlTerm(lambda t, y, args: y[:, None], weak_path(1))
+    at = diffrax.MultiTerm(drift, diffusion), 0.0, 0.1, jnp.array([1.0])
+    square = lambda t, y, args: y[0] ** 2
 
+    @jax.jit
+    def defects():
+        terms, *rest = at
+        defect = lambda solver, order: ds.weak_order_defect(
+            terms, solver, *rest, fn=square, order=order
+        )
+        return defect(diffrax.Euler(), 1), *(defect(diffrax.Heun(), n) for n in (1, 2))
 
-def test_expectation_enumerates_second_and_two_point_variables():
-    class Read(diffrax.AbstractPath):
-        """Shows the extra variables to the vector field as if they were increments."""
-
-        path: ds.WeakBrownianPath
-        t0 = 0
-        t1 = 1
-
-        def evaluate(self, t0, t1=None, left=True):
-            inc = self.path.evaluate(t0, t1, use_levy=True)
-            return jnp.concatenate([inc.W, inc.second, inc.two_point])
-
-    path = weak_path(1, second=True, two_point=True)
-    identity = lambda t, y, args: jnp.eye(3)
-    terms = diffrax.MultiTerm(
-        diffrax.ODETerm(lambda t, y, args: jnp.zeros_like(y)),
-        diffrax.ControlTerm(identity, Read(path)),
-    )
-    h = 0.3
-    powers = lambda t, y, args: jnp.stack([jnp.outer(y, y), jnp.outer(y**2, y**2)])
-    second, fourth = ds.step_expectation(
-        terms, diffrax.Euler(), 0.0, h, jnp.zeros(3), fn=powers
-    )
-    np.testing.assert_allclose(second, h * np.eye(3), atol=1e-15)
-    expected = h**2 * np.array([[3, 1, 1], [1, 3, 1], [1, 1, 1]])
-    np.testing.assert_allclose(fourth, expected, atol=1e-15)
-
-
-def test_shapes_of_paths_are_told_to_be_shapes():
-    field = lambda t, y, args: jax.tree.map(lambda x: x[..., None], y)
-    control = diffrax.ControlTerm(field, (1,))  # pyright: ignore
-    drift, noise = kubo_terms(()).terms
-    says = r"pass `path=solver.path\(shape, key\)`"
-    for term in (noise, control):
-        terms = diffrax.MultiTerm(drift, term)
-        at = terms, ds.ImplicitMidpoint(), 0.0, 0.1, (jnp.array(0.0), jnp.array(1.0))
-        with pytest.raises(ValueError, match=says):
-            ds.second_moment_map(*at)
-        with pytest.raises(ValueError, match=says):
-            ds.step_expectation(*at, fn=lambda t, y, args: y[0])
+    # Heun: y1 = (1 + I + I^2 / 2) y, so E[y1^2] = 1 + 2 h + 3 h^2 / 4. Stratonovich's is
+    # exp(2 h).
+    exact = [0, 0.75 * 0.1**2, (0.75 - 2) * 0.1**2]
+    np.testing.assert_allclose(defects(), exact, atol=1e-15)
 
 
 def test_expectation_needs_paths_of_known_laws():
-    y0 = (jnp.array(0.0), jnp.array(1.0))
+    y0 = jnp.array(0.0), jnp.array(1.0)
+    fn = lambda t, y, args: y[0]
+    at = ds.ImplicitMidpoint(), 0.0, 0.1, y0
     area = diffrax.SpaceTimeLevyArea
     cut = ds.TruncatedBrownianPath(diffrax.UnsafeBrownianPath((), jr.key(0), area))
     known = kubo_terms(ds.WeakBrownianPath((), jr.key(0)))
@@ -100,22 +50,29 @@ def test_expectation_needs_paths_of_known_laws():
         diffrax.MultiTerm(known.terms[0]),
     ):
         with pytest.raises(ValueError, match="must hold Brownian paths whose laws"):
-            ds.step_expectation(
-                terms, ds.ImplicitMidpoint(), 0.0, 0.1, y0, fn=lambda t, y, a: y[0]
-            )
+            ds.step_expectation(terms, *at, fn=fn)
+    # Shapes of paths are told to be shapes.
+    field = lambda t, y, args: jax.tree.map(lambda x: x[..., None], y)
+    control = diffrax.ControlTerm(field, (1,))  # pyright: ignore
+    drift, noise = kubo_terms(()).terms
+    for term in (noise, control):
+        terms = diffrax.MultiTerm(drift, term)
+        for call in (ds.second_moment_map, ft.partial(ds.step_expectation, fn=fn)):
+            with pytest.raises(
+                ValueError, match=r"pass `path=solver.path\(shape, key\)`"
+            ):
+                call(terms, *at)
 
 
-def test_symplecticity_defect_sees_a_method_that_is_not_symplectic():
-    y0, args = random_problem(jr.key(0), 1, 1)
-    terms = ds.hamiltonian_terms(H0, noise, weak_path(1, jr.key(1)))
+def test_symplecticity_defect_sees_a_method_that_is_not_symplectic_and_needs_a_pair():
+    # Of an oscillator over the angle x the step of Heun's method multiplies areas by
+    # (1 - x^2 / 2)^2 + x^2.
+    terms = kubo_terms(Given(jnp.array(0.3)))
     defect = lambda *y: ds.symplecticity_defect(terms, diffrax.Heun(), 0.0, 0.1, *y)
-    assert jax.jit(defect)(y0, args) > 1e-6
-
-
-def test_symplecticity_defect_needs_a_pair():
-    terms = diffrax.ODETerm(lambda t, y, args: -y)
+    found = jax.jit(defect)((jnp.array(0.0), jnp.array(1.0)))
+    np.testing.assert_allclose(found, 0.4**4 / 4, rtol=1e-13)
     with pytest.raises(ValueError, match=r"pair `\(p, q\)`"):
-        ds.symplecticity_defect(terms, ds.ImplicitMidpoint(), 0.0, 0.1, jnp.ones(3))
+        defect(jnp.ones(3))
 
 
 @pytest.mark.parametrize(
