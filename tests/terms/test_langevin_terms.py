@@ -364,7 +364,7 @@ def _start(name, shift):
     return tuple({"x": x[:2], "y": x[2]} for x in (p, q))
 
 
-@pytest.mark.parametrize("name", slow_except(["matrix"], ZERO_SOMEWHERE))
+@pytest.mark.parametrize("name", slow_except(["wall", "matrix"], ZERO_SOMEWHERE))
 def test_derivatives_by_roots_of_zero_are_finite_and_those_of_differences(name):
     solver = ds.BAOAB()
     friction, temperature = ZERO_SOMEWHERE[name]
