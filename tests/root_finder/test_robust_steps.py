@@ -233,26 +233,6 @@ def test_pending_paths_alone_of_nested_batches_are_served_as_one():
         np.testing.assert_array_equal(got, (1 + every) * x[0])
 
 
-@pytest.mark.slow
-def test_steps_of_many_unknowns_are_symplectic():
-    d, solver = 32, ds.ImplicitMidpoint()
-
-    def potential(t, p, q, args):
-        stretch = jnp.diff(q, prepend=0.0, append=0.0)
-        return jnp.sum(jnp.sqrt(1 + p**2)) + jnp.sum(stretch**2 / 2 + stretch**4 / 4)
-
-    kicks = lambda t, p, q, args: 0.2 * jnp.sum(p * q) + jnp.sum(jnp.cos(q + p))
-
-    def defect(key, h):
-        p, q = jr.normal(key, (2, d))
-        terms = ds.hamiltonian_terms(potential, kicks, Given(W=jnp.sqrt(h)))
-        return ds.symplecticity_defect(terms, solver, jnp.zeros(()), h, (p, q))
-
-    h = jnp.geomspace(1e-3, 0.2, 8)
-    defects = eqx.filter_jit(jax.vmap(defect))(jr.split(jr.key(d), 8), h)
-    assert jnp.max(defects) <= 1e-13
-
-
 def test_linear_solvers_of_the_user_solve_for_steps_and_their_derivatives():
     # With one there are no chords, and so no inverse of the Jacobian that nobody asked for.
     term = diffrax.ODETerm(lambda t, y, args: -30 * y + jnp.sin(y[::-1]))

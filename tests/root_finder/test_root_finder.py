@@ -118,22 +118,18 @@ def test_corrections_are_measured_by_the_scale_that_is_passed(slope, most):
         assert not _found(*given)[1]
 
 
-def test_numbers_of_iterations_that_mean_nothing_are_refused():
-    for name in ("rtol", "atol"):
-        for wrong in (-1, float("nan")):
-            with pytest.raises(ValueError, match=f"`{name}` of .* must be >= 0; got"):
-                ds.PicardNewton(**{name: wrong})
-    for name in ("picard_steps", "newton_steps"):
-        for wrong in (np.int64(-1), 2.5):
-            with pytest.raises(ValueError, match=f"`{name}` must be an integer, 0 or"):
-                ds.PicardNewton(**{name: wrong})
-    for name, wrong in (
-        ("root_find_max_steps", -1),
-        ("root_finder", ds.PicardNewton),
-        ("root_finder", None),
+def test_numbers_that_mean_nothing_are_refused():
+    a, b = ds.PicardNewton, ds.ImplicitMidpoint
+    for make, name, wrong, says in (
+        *((a, name, -1, "of .* must be >= 0; got") for name in ("rtol", "atol")),
+        (a, "rtol", float("nan"), "of .* must be >= 0; got"),
+        (a, "picard_steps", np.int64(-1), "must be an integer, 0 or"),
+        (a, "newton_steps", 2.5, "must be an integer, 0 or"),
+        (b, "root_find_max_steps", -1, "must be an? "),
+        *((b, "root_finder", wrong, "must be an? ") for wrong in (a, None)),
     ):
-        with pytest.raises(ValueError, match=f"`{name}` must be an? "):
-            ds.ImplicitMidpoint(**{name: wrong})
+        with pytest.raises(ValueError, match=f"`{name}` {says}"):
+            make(**{name: wrong})
 
 
 @pytest.mark.parametrize("most", [8, 200])

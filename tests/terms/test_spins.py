@@ -1,7 +1,5 @@
 """Spins and rigid bodies: the pair (p, q) stands for s, and each step is a Poisson map."""
 
-import functools as ft
-
 import diffrax
 import equinox as eqx
 import jax
@@ -16,8 +14,19 @@ from ..picard import by_picard
 from ..problems import Given, rigid_body_terms, weak_path
 
 
+def _coefficients(shape, size, spins=2):
+    """Of `sum_j a_j cos(u_j . s + phi_j)` of all components: smooth, and no structure."""
+    rng = np.random.default_rng(spins)
+    u = rng.normal(size=(*shape, 3 * spins)) / np.sqrt(spins)
+    return size * rng.normal(size=shape), u, rng.uniform(0, 2 * np.pi, shape)
+
+
+def _args(spins):
+    of_noise = _coefficients((3, 4), 0.2, spins)
+    return {"drift": _coefficients((4,), 0.5, spins), "noise": of_noise}
+
+
 def H0(t, s, args):
-    """`sum_j a_j cos(u_j . s + phi_j)` of all components: smooth, and no structure."""
     a, u, phi = args["drift"]
     return jnp.sum(a * jnp.cos(u @ s.ravel() + phi + t))
 
@@ -27,28 +36,13 @@ def noise(t, s, args):
     return jnp.sum(a * jnp.cos(u @ s.ravel() + phi - t), axis=-1)
 
 
-@ft.partial(jax.jit, static_argnums=(1, 2, 3))
-def _problem(key, spins: int, m: int, dtype=jnp.float64):
-    """Random spins of lengths from 1/2 to 2, some at a pole, and random `args`."""
-    k_s, k_length, k_pole, kd, kn = jr.split(key, 5)
-    s = jr.normal(k_s, (spins, 3), dtype)
-    pole = jr.randint(k_pole, (spins, 1), 0, 8)
-    s = jnp.where(pole == 0, jnp.array([0, 0, 1], dtype), s)
-    s = jnp.where(pole == 1, jnp.array([0, 0, -1], dtype), s)
-    length = 2 ** jr.uniform(k_length, (spins, 1), dtype, -1, 1)
-    s = length * s / jnp.linalg.norm(s, axis=-1, keepdims=True)
-
-    def coefficients(key, shape, size):
-        ka, ku, kphi = jr.split(key, 3)
-        u = jr.normal(ku, (*shape, 3 * spins), dtype) / np.sqrt(spins)
-        phase = jr.uniform(kphi, shape, dtype, 0, 2 * np.pi)
-        return size * jr.normal(ka, shape, dtype), u, phase
-
-    args = {
-        "drift": coefficients(kd, (4,), 0.5),
-        "noise": coefficients(kn, (m, 4), 0.2),
-    }
-    return s, args
+def _random_steps(spins):
+    """Spins, sizes of steps and increments, a thousand of each."""
+    rng = np.random.default_rng(0)
+    # Uniform in the logarithm over [1e-3, 0.2].
+    h = np.exp(rng.uniform(np.log(1e-3), np.log(0.2), 1000))
+    W = np.sqrt(h)[:, None] * np.clip(rng.normal(size=(1000, 3)), -2.5, 2.5)
+    return 0.7 * rng.normal(size=(1000, spins, 3)), h, W
 
 
 POLES = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
@@ -56,10 +50,10 @@ EQUATOR = np.array([[1.0, 0.0, 0.0], [-0.6, 0.8, -0.0], [0.3, -0.4, 1e-300]])
 
 
 def test_solutions_push_forward_to_the_equation_of_spins_and_of_landau_and_lifshitz():
-    s, args = _problem(jr.key(0), 40, 3)
     # On a lattice of eight times five spins.
-    s = np.concatenate([s[:-5], POLES, EQUATOR]).reshape(8, 5, 3)
-    each = np.random.default_rng(1).uniform(size=(8, 5))
+    rng, args = np.random.default_rng(0), _args(40)
+    s = np.concatenate([rng.normal(size=(35, 3)), POLES, EQUATOR]).reshape(8, 5, 3)
+    each = rng.uniform(size=(8, 5))
     dampings = [None, each, 0.3]
     W = jnp.array([0.3, -0.7, 0.4])
     of = lambda damping: ds.spin_terms(H0, noise, weak_path(3), damping).terms
@@ -83,7 +77,7 @@ def test_solutions_push_forward_to_the_equation_of_spins_and_of_landau_and_lifsh
         expected = turn + rate[..., None] * np.cross(s, turn)
         np.testing.assert_allclose(velocity, expected, atol=1e-14)
     # The damping takes the precision of the spins.
-    short, args = jax.tree.map(lambda x: x.astype(np.float32), (s, args))
+    short, args = jax.tree.map(np.float32, (s, args))
     velocity = lambda s: of(each)[0].vf(jnp.float32(0.4), ds.to_spinors(s), args)
     assert {x.dtype.name for x in jax.eval_shape(velocity, short)} == {"float32"}
 
@@ -91,7 +85,8 @@ def test_solutions_push_forward_to_the_equation_of_spins_and_of_landau_and_lifsh
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
 def test_spinors_of_spins_give_them_back_with_their_derivatives_everywhere(dtype):
     eps = jnp.finfo(dtype).eps
-    s = np.concatenate([_problem(jr.key(0), 40, 3)[0], POLES, EQUATOR])
+    s = np.random.default_rng(0).normal(size=(100, 3))
+    s = np.concatenate([s, POLES, EQUATOR])
     # And where squares leave the range of the numbers.
     extreme = float(jnp.finfo(dtype).max) ** 0.7
     moderate = len(s)
@@ -127,13 +122,7 @@ def test_spinors_of_spins_give_them_back_with_their_derivatives_everywhere(dtype
 def test_a_step_is_a_poisson_map_and_one_for_the_spins_themselves_is_none():
     # A symplectic step for (p, q) is a Poisson map for s, whatever the solver, and every
     # solver has a test that its steps are symplectic.
-    solver = by_picard(ds.ImplicitMidpoint())
-
-    rng = np.random.default_rng(0)
-    s0 = 0.7 * rng.normal(size=(1000, 1, 3))
-    h = np.exp(rng.uniform(np.log(1e-3), np.log(0.2), 1000))
-    W = np.sqrt(h)[:, None] * np.clip(rng.normal(size=(1000, 3)), -2.5, 2.5)
-    _, args = _problem(jr.key(0), 1, 3)
+    solver, args = by_picard(ds.ImplicitMidpoint()), _args(1)
 
     @jax.jit
     @jax.vmap
@@ -141,7 +130,7 @@ def test_a_step_is_a_poisson_map_and_one_for_the_spins_themselves_is_none():
         at = ds.spin_terms(H0, noise, Given(W)), solver, 0.0, h
         return ds.poisson_defect(*at, ds.to_spinors(s0), args)
 
-    assert jnp.max(defect(s0, h, W)) <= 1e-13
+    assert jnp.max(defect(*_random_steps(1))) <= 1e-13
     # The midpoint rule keeps |s| there, but not the bracket.
     at = rigid_body_terms(Given(jnp.array(0.1))), solver, 0.0, 0.2
     other = jax.jit(lambda s0: ds.poisson_defect(*at, s0))(np.array([0.6, 0.0, 0.8]))
@@ -192,17 +181,14 @@ def test_what_are_no_spins_is_refused():
             diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), 0, 1, 0.1, y0)
     with pytest.raises(ValueError, match="real array `s`"):
         ds.poisson_defect(terms, ds.ImplicitMidpoint(), 0.0, 0.1, jnp.ones(4))
-    jitted = jax.jit(ds.to_spinors)
-    for to_spinors in (ds.to_spinors, jitted, jax.vmap(jitted)):
+    for to_spinors in (ds.to_spinors, jax.jit(jax.vmap(ds.to_spinors))):
         with pytest.raises(Exception, match="of nonzero length"):
-            jax.block_until_ready(to_spinors(s[:2].at[1].set(0.0)))
+            jax.block_until_ready(to_spinors(np.array([[1.0, 0, 0], [0, 0, 0]])))
     # Hamiltonians that do not fit.
     with pytest.raises(ValueError, match=r"must be a function, called as `H0\(t, s"):
         ds.spin_terms(1.0, noise, path)
-    with pytest.raises(ValueError, match="must be a Brownian path"):
-        ds.spin_terms(H0, noise, None)
     each = lambda t, s, args: s
-    y0 = ds.to_spinors(s[0])
+    y0 = np.ones(2), np.ones(2)
     for damping in (None, 1.0):
         with pytest.raises(ValueError, match="`H0` must return a scalar"):
             ds.spin_terms(each, each, path, damping).terms[0].vf(0.0, y0, None)
@@ -226,23 +212,20 @@ def test_a_field_on_each_of_many_spins_costs_one_reverse_pass():
 # It makes vector fields of brackets. Quick tests of waves know that spins are pairs of
 # amplitudes, and that steps of the midpoint rule keep the length of these.
 @pytest.mark.slow
-def test_with_damping_plateau_gauss_keeps_lengths_for_a_thousand_random_systems():
-    solver = by_picard(ds.PlateauGauss())
+def test_with_damping_plateau_gauss_keeps_lengths_in_a_thousand_steps():
+    solver, args = by_picard(ds.PlateauGauss()), _args(2)
 
-    def change(key):
-        k_problem, k_h, k_W, k_alpha = jr.split(key, 4)
-        s0, args = _problem(k_problem, 2, 3)
-        h = jnp.exp(jr.uniform(k_h, (), float, jnp.log(1e-3), jnp.log(0.2)))
-        W = jnp.sqrt(h) * jnp.clip(jr.normal(k_W, (3,)), -2.5, 2.5)
-        given, alpha = Given(W, H=W[::-1] / 4), jr.uniform(k_alpha, (2,))
+    @jax.jit
+    @jax.vmap
+    def change(s0, h, W, alpha):
+        given, y0 = Given(W, H=W[::-1] / 4), ds.to_spinors(s0)
         terms = ds.spin_terms(H0, noise, given, damping=alpha)
-        y0 = ds.to_spinors(s0)
         y1, *_ = solver.step(terms, 0.0, h, y0, args, None, False)
         before, after = (jnp.linalg.norm(ds.from_spinors(y), axis=-1) for y in (y0, y1))
         return jnp.max(jnp.abs(after / before - 1))
 
-    changes = jax.jit(jax.vmap(change))(jr.split(jr.key(0), 1000))
-    assert jnp.max(changes) <= 1e-13
+    alpha = np.random.default_rng(1).uniform(size=(1000, 2))
+    assert jnp.max(change(*_random_steps(2), alpha)) <= 1e-13
 
 
 def test_dampings_that_are_none_are_refused():
@@ -251,7 +234,7 @@ def test_dampings_that_are_none_are_refused():
     for wrong in (-0.1, jnp.nan, jnp.inf, 1j, "much", array, array > -1, 1j * array):
         with pytest.raises(ValueError, match="`damping` must be a number"):
             ds.spin_terms(H0, noise, path, damping=wrong)  # pyright: ignore
-    y0, args = (np.ones((2, 2)), np.ones((2, 2))), _problem(jr.key(0), 2, 3)[1]
+    y0, args = (np.ones((2, 2)), np.ones((2, 2))), _args(2)
     for shape in ((3,), (1,), (2, 1)):
         terms = ds.spin_terms(H0, noise, path, damping=jnp.ones(shape))
         with pytest.raises(ValueError, match=r"one for each spin, of shape \(2,\)"):
