@@ -125,15 +125,6 @@ def test_path_takes_any_pytree_under_jit_and_vmap():
     jax.tree.map(np.testing.assert_array_equal, at_end, over_step)
 
 
-def test_malformed_shapes_are_refused():
-    for dtype in (jnp.int32, jnp.complex64):
-        with pytest.raises(ValueError, match="real floating-point"):
-            ds.WeakBrownianPath(jax.ShapeDtypeStruct((2,), dtype), jr.key(0))
-    for shape in (3, [2]):
-        with pytest.raises(ValueError, match="tuple of integers"):
-            ds.WeakBrownianPath(shape, jr.key(0))
-
-
 def test_half_steps_work_where_the_path_can_be_refined():
     H0 = lambda t, p, q, args: p**2 / 2 + q**4 / 4
     noise = lambda t, p, q, args: jnp.stack([jnp.sin(q)])

@@ -66,8 +66,7 @@ def test_leaves_that_vanish_do_not_keep_it_from_finishing():
         a, b = x
         return a - 1 + 1e-3 * jnp.sin(b), b - 1e-3 * (a - 1) ** 2 * b
 
-    start = jnp.array(0.5), jnp.array(0.1)
-    value, success = _found(residual, start, max_steps=20)
+    value, success = _found(residual, (jnp.array(0.5), jnp.array(0.1)), max_steps=20)
     assert success
     np.testing.assert_allclose(value, (1, 0), atol=1e-13)
 

@@ -21,26 +21,29 @@ def test_terms_are_the_symplectic_gradients():
     H0 = lambda t, p, q, args: jnp.sum(p**2) * args + jnp.cos(t) * jnp.sum(p * q**2)
     noise = lambda t, p, q, args: jnp.stack([jnp.sum(q**3), args * jnp.sum(p * q)])
     drift, diffusion = ds.hamiltonian_terms(H0, noise, weak_path(2)).terms
-    p, q = jnp.array([0.3, -0.5]), jnp.array([0.2, 0.9])
-    t, args = 0.4, 1.7
-    f, g = drift.vf(t, (p, q), args)
-    np.testing.assert_allclose(f, -np.cos(t) * 2 * p * q, rtol=1e-14)
-    np.testing.assert_allclose(g, 2 * args * p + np.cos(t) * q**2, rtol=1e-14)
-    sigma, gamma = diffusion.vf(t, (p, q), args)
-    np.testing.assert_allclose(sigma, np.stack([-3 * q**2, -args * p], 1), rtol=1e-14)
-    np.testing.assert_allclose(gamma, np.stack([0 * q, args * q], 1), rtol=1e-14)
-    control = jnp.array([0.7, -1.1])
-    for got in (
-        diffusion.vf_prod(t, (p, q), args, control),
-        diffusion.prod((sigma, gamma), control),
-    ):
-        np.testing.assert_allclose(got[0], sigma @ control, rtol=1e-14)
-        np.testing.assert_allclose(got[1], gamma @ control, rtol=1e-14)
     # One noise may be a scalar.
-    drift, diffusion = ds.hamiltonian_terms(H0, H0, ()).terms
-    for W in (jnp.array(0.3), jnp.array([0.3])):
-        kick = diffusion.vf_prod(t, (p, q), args, W)
-        np.testing.assert_allclose(kick, np.multiply(drift.vf(t, (p, q), args), 0.3))
+    _, single = ds.hamiltonian_terms(H0, H0, ()).terms
+    p, q = np.array([0.3, -0.5]), np.array([0.2, 0.9])
+    t, args, control = 0.4, 1.7, np.array([0.7, -1.1])
+
+    @jax.jit
+    def fields(p, q):
+        at = t, (p, q), args
+        vf = diffusion.vf(*at)
+        products = diffusion.vf_prod(*at, control), diffusion.prod(vf, control)
+        kicks = [single.vf_prod(*at, W) for W in (jnp.array(0.3), jnp.array([0.3]))]
+        return drift.vf(*at), vf, products, kicks
+
+    (f, g), (sigma, gamma), products, kicks = fields(p, q)
+    same = ft.partial(np.testing.assert_allclose, rtol=1e-14)
+    same(f, -np.cos(t) * 2 * p * q)
+    same(g, 2 * args * p + np.cos(t) * q**2)
+    same(sigma, np.stack([-3 * q**2, -args * p], 1))
+    same(gamma, np.stack([0 * q, args * q], 1))
+    for got in products:
+        same(got, (sigma @ control, gamma @ control))
+    for kick in kicks:
+        same(kick, np.multiply((f, g), 0.3))
 
 
 def test_state_and_noise_may_be_any_pytrees():
@@ -130,26 +133,18 @@ def test_the_same_equation_in_other_terms_has_the_same_step():
 
 
 def test_without_noise_terms_are_the_drift():
-    def harmonic(t, s, args):
-        return jnp.sum(s[..., 2] ** 2) / 2
-
-    path = weak_path(1)
-    y0, args = random_problem(jr.key(0), 2, 1)
-    waves = jnp.array([0.3 + 0.1j, 0.2 - 0.4j])
-    spinors = ds.to_spinors(jnp.array([0.6, 0.0, 0.8]))
-    amplitude = lambda t, psi, args: jnp.sum(jnp.abs(psi) ** 4)
-    for make, energy, y, parameters in (
-        (ds.hamiltonian_terms, H0, y0, args),
-        (ds.spin_terms, harmonic, spinors, None),
-        (ft.partial(ds.spin_terms, damping=0.1), harmonic, spinors, None),
-        (ds.wave_terms, amplitude, ds.to_pair(waves), None),
-        (ft.partial(ds.wave_terms, damping=0.1), amplitude, ds.to_pair(waves), None),
-    ):
-        both = make(energy), make(energy, energy, path)
-        assert len(both[0].terms) == 1
-        field = lambda y, terms: terms.terms[0].vf(0.0, y, parameters)
-        fields = jax.jit(lambda y, both=both: [field(y, x) for x in both])(y)
-        jax.tree.map(np.testing.assert_array_equal, *fields)
+    H0 = lambda t, p, q, args: jnp.sum(p**2 * q**2)
+    of_last = lambda t, x, args: jnp.sum(jnp.abs(x[..., -1]) ** 2)
+    y = tuple(np.random.default_rng(0).normal(size=(2, 2)))
+    makers = [(ds.hamiltonian_terms, H0)]
+    for make in (ds.spin_terms, ds.wave_terms):
+        makers += [(make, of_last), (ft.partial(make, damping=0.1), of_last)]
+    both = [(make(H), make(H, H, weak_path(1))) for make, H in makers]
+    assert all(len(alone.terms) == 1 for alone, _ in both)
+    field = lambda y, terms: terms.terms[0].vf(0.0, y, None)
+    fields = jax.jit(lambda y: [[field(y, x) for x in pair] for pair in both])(y)
+    for pair in fields:
+        np.testing.assert_array_equal(*pair)
 
 
 def test_a_hamiltonian_that_changes_its_args_changes_a_copy():
@@ -164,7 +159,8 @@ def test_a_hamiltonian_that_changes_its_args_changes_a_copy():
         terms = ds.hamiltonian_terms(H, H, weak_path(1)).terms
         return [term.vf(0.0, y0, args) for term in terms]
 
-    jax.tree.map(np.testing.assert_array_equal, fields(doubles), fields(plain))
+    both = jax.jit(lambda: (fields(doubles), fields(plain)))()
+    jax.tree.map(np.testing.assert_array_equal, *both)
     assert args == {"k": 1.5}
 
 
