@@ -57,7 +57,7 @@ def test_the_bound_is_that_of_the_docstring_and_the_error_of_the_order_of_the_pa
         assert 2 * np.trapezoid((x - bound) ** 2 * density, x) <= (h / unit) ** k
 
 
-def test_what_truncates_nothing_is_refused():
+def test_what_cannot_be_wrapped_is_refused():
     gaussian = ds.FixedStepBrownianPath((), jr.key(0))
     for unit in (0.0, -1.0, np.inf, np.nan, jnp.ones(2), "s"):
         with pytest.raises(ValueError, match="`unit` must be a positive number"):
@@ -68,7 +68,15 @@ def test_what_truncates_nothing_is_refused():
     with pytest.raises(ValueError, match="wraps a Brownian path"):
         ds.TruncatedBrownianPath(lambda t0, t1: 0.0)  # pyright: ignore
     with pytest.raises(ValueError, match="already bounded"):
-        ds.TruncatedBrownianPath(ds.WeakBrownianPath((), jr.key(0)))
+        ds.TruncatedBrownianPath(weak_path(2))
+    for wrapper in (ds.PlateauBrownianPath, ds.LevyAreaBrownianPath):
+        with pytest.raises(ValueError, match="needs a path with space-time"):
+            wrapper(weak_path(2), jr.key(0))
+    tree = ds.FixedStepBrownianPath((1,), jr.key(0), diffrax.SpaceTimeLevyArea)
+    with pytest.raises(ValueError, match="`num_terms` must be"):
+        ds.LevyAreaBrownianPath(tree, jr.key(0), num_terms=-1)
+    with pytest.raises(ValueError, match="`cell` must be"):
+        ds.LevyAreaBrownianPath(tree, jr.key(0), cell=0.0)
 
 
 def test_plateaus_are_fair_and_have_the_mean_square_of_the_path():
@@ -91,15 +99,3 @@ def test_plateaus_are_fair_and_have_the_mean_square_of_the_path():
     later = path.evaluate(h, 2 * h, use_levy=True)
     for other in (first.W, first.H, later.C):
         assert abs(np.mean(first.C * other)) <= bound * np.std(other)
-
-
-def test_plateaus_and_levy_areas_need_a_path_with_areas():
-    for wrapper in (ds.PlateauBrownianPath, ds.LevyAreaBrownianPath):
-        with pytest.raises(ValueError, match="needs a path with space-time"):
-            wrapper(weak_path(2), jr.key(0))
-    levy = diffrax.SpaceTimeLevyArea
-    tree = diffrax.VirtualBrownianTree(0.0, 1.0, 0.1, (1,), jr.key(0), levy)
-    with pytest.raises(ValueError, match="`num_terms` must be"):
-        ds.LevyAreaBrownianPath(tree, jr.key(0), num_terms=-1)
-    with pytest.raises(ValueError, match="`cell` must be"):
-        ds.LevyAreaBrownianPath(tree, jr.key(0), cell=0.0)

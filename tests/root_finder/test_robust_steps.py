@@ -66,16 +66,6 @@ def test_iterations_of_newton_end_when_they_should():
     assert not success(jnp.array(jnp.nan), 10**9)
 
 
-def test_a_step_is_solved_though_some_iterates_have_no_values():
-    # Newton's method for the whole step comes to roots of negative numbers.
-    term = diffrax.ODETerm(lambda t, y, args: -5 * jnp.sqrt(y))
-    y0 = 1 + 0.01 * jnp.arange(6)
-    step = jax.jit(lambda y0: _one_step(ds.ImplicitMidpoint(), term, 1.0, y0))
-    y1, success = step(y0)
-    assert success
-    np.testing.assert_allclose(y1, y0 - 5 * jnp.sqrt((y0 + y1) / 2), atol=1e-14)
-
-
 def test_many_unknowns_are_solved_without_a_matrix():
     # A Schroedinger lattice: frequencies up to n^2, of which h resolves few.
     n, h = 100, 2e-3

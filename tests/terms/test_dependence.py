@@ -142,9 +142,7 @@ PROGRAMS = {
         ],
         False,
     ),
-    "zeros plus": (lambda x, y: jnp.zeros(2) + x, False),
     "chosen branch": (lambda x, y: jax.lax.cond(x > 0, jnp.sin, jnp.cos, y), False),
-    "sign": (lambda x, y: y + jnp.sign(x), False),
     "call back": (
         lambda x, y: jax.pure_callback(
             lambda v: v, jax.ShapeDtypeStruct((), float), x, vmap_method="sequential"

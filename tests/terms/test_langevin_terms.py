@@ -264,29 +264,24 @@ def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
 def test_numbers_for_each_particle_are_repeated_along_the_axes_of_space():
     masses = jnp.arange(1.0, 5.0)[:, None]
     H0 = lambda t, p, q, args: jnp.sum(p**2 / masses) / 2 + jnp.sum(q**2)
-    y0 = np.ones((4, 3)), np.ones((4, 3))
-    path = ds.WeakBrownianPath((4, 3), jr.key(0))
+    ones = np.ones((4, 3))
 
     def fields(friction, temperature):
-        force, noise = ds.bath_terms(H0, friction, temperature, path).terms
+        terms = ds.bath_terms(H0, friction, temperature, (4, 3)).terms
+        return [term.vf(0.0, (ones, ones), None)[0] for term in terms]
 
-        @jax.jit
-        def both(y0):
-            kick = noise.vf_prod(0.0, y0, None, np.ones((4, 3)))
-            return force.vf(0.0, y0, None)[0], kick[0]
-
-        return both(y0)
-
-    whole = masses * jnp.ones((4, 3))
-    for friction in (masses, lambda t, q, args: masses):
-        got = fields(friction, masses / 2)
-        np.testing.assert_array_equal(got, fields(whole, whole / 2))
+    at_q = lambda t, q, args: masses
+    whole = masses * ones
+    given = (masses, masses / 2), (at_q, masses / 2), (whole, whole / 2)
+    *others, expected = jax.jit(lambda: [fields(*pair) for pair in given])()
+    for other in others:
+        jax.tree.map(np.testing.assert_array_equal, other, expected)
     # One number for each axis, or for each particle: which of them is meant?
-    for given in (masses[:, 0], lambda t, q, args: masses[:, 0]):
+    for wrong in (masses[:, 0], lambda t, q, args: masses[:, 0]):
         with pytest.raises(ValueError, match=r"pass `friction\[:, None\]`"):
-            fields(given, 1.0)
+            fields(wrong, 1.0)
         with pytest.raises(ValueError, match=r"pass `temperature\[:, None\]`"):
-            fields(1.0, given)
+            fields(1.0, wrong)
 
 
 def test_a_matrix_for_momenta_with_two_axes_is_an_operator_on_their_structure():

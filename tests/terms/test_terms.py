@@ -164,15 +164,6 @@ def test_a_hamiltonian_that_changes_its_args_changes_a_copy():
     assert args == {"k": 1.5}
 
 
-def test_noise_alone_can_be_solved():
-    path = weak_path(1)
-    term = diffrax.ControlTerm(lambda t, y, args: y[:, None], path)
-    at = term, 0.0, 0.1, jnp.ones(1), None, None, False
-    y1, *_ = by_picard(ds.ImplicitMidpoint()).step(*at)
-    W = path.evaluate(0.0, 0.1)
-    np.testing.assert_allclose(y1, (1 + W / 2) / (1 - W / 2), rtol=1e-13)
-
-
 def test_integer_times_are_times():
     moving = lambda t, p, q, args: jnp.sum(p**2 / 2 + jnp.cos(3 * t) * q)
     terms = ds.hamiltonian_terms(moving, lambda t, p, q, args: -q, weak_path(1))
