@@ -193,6 +193,7 @@ def test_what_is_no_key_is_refused():
     tree = diffrax.UnsafeBrownianPath((2,), jr.key(0), diffrax.SpaceTimeLevyArea)
     for make in (
         lambda key: ds.WeakBrownianPath((2,), key),
+        lambda key: ds.FixedStepBrownianPath((2,), key),
         lambda key: ds.PlateauBrownianPath(tree, key),
         lambda key: ds.LevyAreaBrownianPath(tree, key),
     ):

@@ -58,22 +58,15 @@ def test_systems_in_any_units_are_solved_and_those_without_numbers_are_not(n):
     assert not np.any(found[2:] & np.all(np.isfinite(got[2:]), axis=1))
 
 
-@pytest.mark.parametrize(
-    "n, dtype",
-    [
-        (3, jnp.float64),
-        pytest.param(3, jnp.float32, marks=pytest.mark.slow),
-        pytest.param(40, jnp.float64, marks=pytest.mark.slow),
-    ],
-)
-def test_derivatives_are_solved_whether_iteration_converges_or_not(n, dtype):
+@pytest.mark.parametrize("n", [3, pytest.param(40, marks=pytest.mark.slow)])
+def test_derivatives_are_solved_whether_iteration_converges_or_not(n):
     # Symmetric and antisymmetric matrices, of spectral radii on both sides of one and of
     # what is accelerated, side by side in one batch.
     random = np.random.default_rng(n).normal(size=(2, n, n))
     parts = [random[0] + random[0].T, random[1] - random[1].T]
     parts = [x / np.max(np.abs(np.linalg.eigvals(x))) for x in parts]
-    L = np.array([r * x for r in (0.01, 0.7, 2.5, 6.5) for x in parts], dtype)
-    b = np.random.default_rng(0).normal(size=(len(L), n)).astype(dtype)
+    L = np.array([r * x for r in (0.01, 0.7, 2.5, 6.5) for x in parts])
+    b = np.random.default_rng(0).normal(size=(len(L), n))
 
     @jax.vmap
     def tangent(L, b):
@@ -85,10 +78,9 @@ def test_derivatives_are_solved_whether_iteration_converges_or_not(n, dtype):
         return value, *transpose(b)
 
     value, adjoint = value_and_adjoint(L, b)
-    one, L = np.eye(n, dtype=dtype), np.asarray(L)
+    one = np.eye(n)
     for x, A in ((value, one - L), (adjoint, one - np.swapaxes(L, 1, 2))):
-        assert x.dtype == dtype
         residual = np.linalg.norm(np.einsum("bij,bj->bi", A, x) - b, axis=1)
         size = np.linalg.norm(A, axis=(1, 2)) * np.linalg.norm(x, axis=1)
         # At most 2 are measured, over sixty right-hand sides.
-        assert np.all(residual <= 4 * np.finfo(dtype).eps * size)
+        assert np.all(residual <= 4 * np.finfo(float).eps * size)

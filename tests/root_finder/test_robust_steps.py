@@ -26,13 +26,11 @@ def _one_step(solver, term, h, y0):
     return y1, result == diffrax.RESULTS.successful
 
 
-@pytest.mark.parametrize(
-    "d, most", [(2, 1), pytest.param(6, 8, marks=pytest.mark.slow)]
-)
-def test_steps_of_stiff_networks_are_solved(d, most):
-    # For two unknowns Newton's method alone fails in 26 of these, and shortened corrections
-    # stall in more. The steps that fail have no solution on the branch from their start;
-    # two of the eight have others.
+def test_steps_of_stiff_networks_are_solved():
+    # Newton's method alone fails in 26 of these, and shortened corrections
+    # stall in more. The step that fails has no solution on the branch from its start.
+    d = 2
+
     def residual(key):
         a, b, c = jr.split(key, 3)
         W1, W2 = jr.normal(a, (4, d)), 2 * jr.normal(b, (d, 4))
@@ -42,7 +40,7 @@ def test_steps_of_stiff_networks_are_solved(d, most):
         return success, y1 - y0 - W2 @ jnp.tanh(W1 @ (y0 + y1) / 2)
 
     success, error = jax.jit(jax.vmap(residual))(jr.split(jr.key(0), 400))
-    assert jnp.sum(~success) <= most
+    assert jnp.sum(~success) <= 1
     assert jnp.max(jnp.abs(error[success])) <= d**2 * 5e-15
 
 

@@ -112,7 +112,7 @@ def test_the_same_equation_in_other_terms_has_the_same_step():
     plain = diffrax.ODETerm(on_array(both))
     nested = diffrax.MultiTerm(friction, diffrax.MultiTerm(drift))
     whole = diffrax.ODETerm(both)
-    of_pairs = (whole, diffusion), (drift, diffusion, friction), (diffusion, nested)
+    of_pairs = (whole, diffusion), (diffusion, nested)
     of_arrays = (plain, diffrax.ControlTerm(noises, path)), (plain, one(0), one(1))
 
     def step(terms, y0):

@@ -172,15 +172,6 @@ def test_noises_of_waves_may_be_indexed():
     np.testing.assert_allclose(*fields, atol=1e-15)
 
 
-def test_two_amplitudes_are_a_spin_with_twice_the_damping():
-    H0 = lambda t, s, args: jnp.sum(s[..., 2] + 0.3 * s[..., 0] ** 2)
-    as_waves = lambda t, psi, args: H0(t, ds.from_spinors(ds.to_pair(psi)), args)
-    y = np.random.default_rng(0).normal(size=(2, 5, 2))
-    both = ds.spin_terms(H0, damping=2 * ALPHA), ds.wave_terms(as_waves, damping=ALPHA)
-    fields = jax.jit(lambda p, q: [x.terms[0].vf(0.0, (p, q), None) for x in both])(*y)
-    np.testing.assert_allclose(*fields, atol=1e-14)
-
-
 def test_density_of_gibbs_solves_the_equation_of_fokker_and_planck():
     # div(a rho) = 1/2 sum_k div(b_k div(b_k rho)) for the Stratonovich fields a and b_k.
     T = 0.6
