@@ -98,30 +98,22 @@ def test_wrappers_make_the_same_step_from_words_as_from_keys():
     plateaus = ds.PlateauBrownianPath(path, key)
     # The signs are the first bits: those of the words that the path takes are others.
     assert np.all(more(2, 0) >> 31 != more(2, words.PLATEAU_WORDS) >> 31)
-    cases = (
-        (path, own),
+    for wrapped, given in (
         (ds.TruncatedBrownianPath(path, k=1), own),
         (plateaus, jnp.append(own, more(2, words.PLATEAU_WORDS))),
         (ds.TruncatedBrownianPath(areas), jnp.append(own, more(9, words.AREA_WORDS))),
-    )
-
-    @jax.jit
-    def all_at_once(t0, t1):
-        return [
-            (
+    ):
+        assert wrapped.num_words(use_levy=True) == len(given)
+        assert wrapped.num_words() == 2
+        expected, got, W, evaluated, back = jax.jit(
+            lambda given, t0, t1, wrapped=wrapped: (
                 wrapped.evaluate(t0, t1, use_levy=True),
                 wrapped.increment(given, t0, t1, use_levy=True),
                 wrapped.increment(given[:2], t0, t1),
                 wrapped.evaluate(t0, t1),
                 wrapped.evaluate(t1, t0, use_levy=True),
             )
-            for wrapped, given in cases
-        ]
-
-    for (wrapped, given), results in zip(cases, all_at_once(t0, t1)):
-        expected, got, W, evaluated, back = results
-        assert wrapped.num_words(use_levy=True) == len(given)
-        assert wrapped.num_words() == 2
+        )(given, t0, t1)
         assert type(got) is type(expected) is wrapped.levy_area
         for a, b in zip(jax.tree.leaves(got), jax.tree.leaves(expected)):
             np.testing.assert_allclose(a, b, rtol=1e-14)

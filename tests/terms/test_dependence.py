@@ -127,12 +127,6 @@ PROGRAMS = {
     "repeated": (lambda x, y: _count(3, lambda s: 2 * s, y), True),
     "repeated as often as x says": (lambda x, y: _count(x, lambda s: 2 * s, y), False),
     "read in a loop": (lambda x, y: _count(3, lambda s: s + x, y), False),
-    "carried from one to the other": (
-        lambda x, y: jax.lax.fori_loop(0, 3, lambda i, s: (s[1], s[2], x), (y, y, y))[
-            0
-        ],
-        False,
-    ),
     "chosen branch": (lambda x, y: jax.lax.cond(x > 0, jnp.sin, jnp.cos, y), False),
     "call back": (
         lambda x, y: jax.pure_callback(

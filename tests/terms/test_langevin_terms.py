@@ -224,7 +224,6 @@ def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
         ((-1.0, T, (3,)), "`friction` must be a real number.*not negative; got -1.0"),
         ((np.nan, T, (3,)), "`friction` must be .*finite"),
         ((1j, T, (3,)), "`friction` must be a real number"),
-        ((True, T, (3,)), "`friction` must be a real number"),
         ((None, T, (3,)), "`friction` must be a number"),
         ((jnp.ones(2), T, (3,)), r"and the momenta, \(3,\).*got shape \(2,\)"),
         ((jnp.eye(3), T, (3,)), r"Pass a matrix as `lineax.MatrixLinearOperator"),
@@ -235,10 +234,8 @@ def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
         (({"a": 1.0}, T, (3,)), "`friction` must be .* structure of the momenta"),
         ((lambda q: 1.0, T, (3,)), r"`friction\(t, q, args\)`"),
         ((1.0, -T, (3,)), "`temperature` must be a real number.*not negative"),
-        ((1.0, "hot", (3,)), "`temperature` must be"),
         ((1.0, lambda t: 1.0, (3,)), r"`temperature\(t, q, args\)`"),
         ((1.0, T), "both a `temperature` and a `path`"),
-        ((1.0, None, (3,)), "both a `temperature` and a `path`"),
         ((1.0, T, 3), "`path` must be a Brownian path"),
         ((ds.FrictionAlong(lambda q: q), T, (3,)), r"`directions\(t, q, args\)`"),
     ):

@@ -19,7 +19,8 @@ from diffrax_symplectic._terms import brownian_paths
 
 
 ONE = jnp.array(0.0), jnp.array(1.0)
-MIDPOINT = ds.ImplicitMidpoint()
+# Sweeps solve all steps here.
+MIDPOINT = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(newton_steps=0))
 WELL = lambda t, p, q, args: (p**2 + q**2) / 2
 KICK = lambda t, p, q, args: -0.5 * q
 SPRING = lambda t, p, q, args: 0.5 * q**2 / 2
