@@ -113,7 +113,7 @@ def test_the_derivative_of_a_failed_step_is_zero():
 
 def test_a_failure_anywhere_in_a_step_is_reported():
     # Two systems one after another; what the other one's success says must not count.
-    # One block of `StrangGauss` has more unknowns than the others, and is solved otherwise.
+    # One block of `StrangGauss` has more unknowns than the others.
     def success(sizes):
         stuck = lambda t, p, q, args: sizes[0] * jnp.sum(p * q**2)
         kicks = lambda t, p, q, args: sizes[1] * jnp.sum(p * q**2)

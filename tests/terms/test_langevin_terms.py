@@ -297,23 +297,23 @@ def test_a_matrix_for_momenta_with_two_axes_is_an_operator_on_their_structure():
 
 def test_derivatives_by_roots_of_zero_are_finite_and_those_of_differences():
     # Three baths whose friction is zero along some direction, or on one side of a wall.
-    pair = jnp.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
-    directions = jnp.array([[1.0, 0.0], [-1.0, 0.0], [0, 0]])
+    pair = jnp.array([[1.0, -1.0], [-1.0, 1.0]])
+    directions = jnp.array([[1.0, 0.0], [-1.0, 0.0]])
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + jnp.sum(jnp.cos(q))
     solver = ds.BAOAB()
 
     def end(x):
         a, shift = x
         wall = lambda t, q, args: a * jnp.maximum(q - 1, 0)
-        noises = [Given(0.3 * jnp.cos(7.0 * jnp.arange(m))) for m in (3, 3, 2)]
+        noises = [Given(jnp.array(x)) for x in ([0.3, 0.2], [-0.1, 0.4], [0.2, 0.1])]
         terms = diffrax.MultiTerm(
             *ds.langevin_terms(H0, as_friction(a * pair), a, noises[0]).terms,
-            *ds.bath_terms(H0, wall, a * jnp.array([1.0, 0.0, 2.0]), noises[1]).terms,
+            *ds.bath_terms(H0, wall, a * jnp.array([0.0, 2.0]), noises[1]).terms,
             *ds.bath_terms(
                 H0, ds.FrictionAlong(a * directions), 0 * a, noises[2]
             ).terms,
         )
-        y0 = jnp.linspace(0.3, 0.5, 3), jnp.linspace(0.2, 1.7, 3) + shift
+        y0 = jnp.array([0.3, 0.5]), jnp.array([0.2, 1.7]) + shift
         state = solver.init(terms, 0.0, 0.3, y0, None)
         y1, *_ = solver.step(terms, 0.0, 0.3, y0, None, state, False)
         return jnp.sum(jnp.sin(jnp.stack(y1)))
