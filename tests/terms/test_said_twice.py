@@ -108,8 +108,6 @@ def test_noise_alone_is_that_of_the_whole_terms():
     assert type(alone) is type(noise)
     one = jnp.ones(())
     assert alone.vf_prod(0.0, ONE, None, one) == noise.vf_prod(0.0, ONE, None, one)
-    with pytest.raises(ValueError, match="`structure` must be one of"):
-        ds.noise_terms(SPRING, path(1), structure="any")  # pyright: ignore
 
 
 def test_of_several_traced_paths_it_is_not_known_whether_they_are_one():

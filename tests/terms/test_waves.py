@@ -62,7 +62,8 @@ def _by_conjugate(H, psi):
 def test_solutions_push_forward_to_the_equation_of_amplitudes_with_and_without_damping():
     psi = _random((40, 3)) / 3
     rng = np.random.default_rng(1)
-    dampings, W = [None, rng.uniform(size=40), 0.3], rng.normal(size=(40, 3, 3))
+    dampings = [None, rng.uniform(size=40), 0.3]
+    W = jnp.array(rng.normal(size=(40, 3, 3)))
     T = 0.6
     terms = [ds.wave_terms(_phases, _thermal, _path(40, 3), x).terms for x in dampings]
 
