@@ -79,8 +79,7 @@ def test_a_leaf_that_rounding_errors_keep_moving_does_not_keep_it_from_finishing
         moving = 1e-15 * jnp.sin(1e17 * b)
         return a - 1 - 0.01 * jnp.sin(a), b - 1e-8 - jax.lax.stop_gradient(moving)
 
-    start = jnp.array(0.5), jnp.array(0.0)
-    value, success = _found(residual, start, SWEEPS)
+    value, success = _found(residual, (jnp.array(0.5), jnp.array(0.0)), SWEEPS)
     assert success
     np.testing.assert_allclose(value[1], 1e-8, atol=1e-14)
 
