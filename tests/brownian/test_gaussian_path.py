@@ -141,18 +141,17 @@ def test_bad_arguments_are_refused():
 
 def test_steps_shorter_than_the_tolerance_of_a_tree_are_an_error():
     # The tree would interpolate, and the noise have a fraction of its variance.
+    tree = diffrax.VirtualBrownianTree(0.0, 4.0, 0.1, (), jr.key(0))
+    terms = ds.noise_terms(lambda t, p, q, args: q, ds.TruncatedBrownianPath(tree))
+
     @eqx.filter_jit
-    def step(h, tol):
-        tree = diffrax.VirtualBrownianTree(0.0, 4.0, tol, (), jr.key(0))
-        path = ds.TruncatedBrownianPath(tree)
-        terms = ds.noise_terms(lambda t, p, q, args: q, path)
+    def step(h):
         given = terms, 1.0, 1.0 + h, (0.0, 1.0), None, None, False
         return ds.StormerVerlet().step(*given)[0]
 
-    assert jnp.isfinite(step(jnp.array(0.1), 0.1)[0])
-    for h, tol in ((0.09, 0.1), (0.1, 0.5)):
-        with pytest.raises(Exception, match="Pass a smaller `tol`"):
-            jax.block_until_ready(step(jnp.array(h), tol))
+    assert jnp.isfinite(step(jnp.array(0.1))[0])
+    with pytest.raises(Exception, match="Pass a smaller `tol`"):
+        jax.block_until_ready(step(jnp.array(0.09)))
 
 
 @pytest.mark.parametrize(
