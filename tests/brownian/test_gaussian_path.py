@@ -62,7 +62,8 @@ def test_sampled_steps_and_noises_are_independent_with_the_right_variance():
 
 
 def test_steps_of_cells_are_sums_and_areas_of_one_motion():
-    cell, n, dtype = 2.0**-4, 8, np.float32
+    cell = 2.0**-4
+    dtype = np.float32
     shape = {
         "a": jax.ShapeDtypeStruct((2,), dtype),
         "b": jax.ShapeDtypeStruct((), dtype),
@@ -70,7 +71,7 @@ def test_steps_of_cells_are_sums_and_areas_of_one_motion():
     path = ds.FixedStepBrownianPath(shape, jr.key(0), AREA, cell=cell)
     evaluate = jax.jit(lambda t0, t1: path.evaluate(t0, t1, use_levy=True))
     flat = lambda x: np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)])
-    t = dtype(-0.25) + cell * np.arange(n + 1, dtype=dtype)
+    t = dtype(-0.25) + cell * np.arange(9, dtype=dtype)
     cells = [evaluate(a, b) for a, b in zip(t[:-1], t[1:])]
     w = np.array([flat(c.W) for c in cells])
     mean = np.array([flat(c.H) for c in cells]) + w / 2

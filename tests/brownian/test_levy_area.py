@@ -27,7 +27,9 @@ def test_areas_have_the_covariances_and_kurtosis_of_the_law(terms):
 
     # Of a step for which `W` has the variance 1.
     of_step = jax.jit(jax.vmap(draw))(jr.split(jr.key(1), N))
-    W, H, A = of_step.W / np.sqrt(h), of_step.H / np.sqrt(h), of_step.A / h
+    W = of_step.W / np.sqrt(h)
+    H = of_step.H / np.sqrt(h)
+    A = of_step.A / h
     np.testing.assert_allclose(A, -np.swapaxes(A, 1, 2), atol=1e-14)
     a, b = A[:, 0, 1], A[:, 0, 2]
     bridge = H[:, 0] * W[:, 1] - H[:, 1] * W[:, 0]

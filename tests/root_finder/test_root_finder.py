@@ -117,15 +117,16 @@ def test_corrections_are_measured_by_the_scale_that_is_passed(slope, most):
 
 
 def test_numbers_that_mean_nothing_are_refused():
-    a, b = ds.PicardNewton, ds.ImplicitMidpoint
-    for make, name, wrong, says in (
-        *((a, name, -1, "of .* must be >= 0; got") for name in ("rtol", "atol")),
-        (a, "rtol", float("nan"), "of .* must be >= 0; got"),
-        (a, "picard_steps", np.int64(-1), "must be an integer, 0 or"),
-        (a, "newton_steps", 2.5, "must be an integer, 0 or"),
-        (b, "root_find_max_steps", -1, "must be an? "),
-        *((b, "root_finder", wrong, "must be an? ") for wrong in (a, None)),
+    for name, wrong, says in (
+        ("rtol", float("nan"), "of .* must be >= 0; got"),
+        ("atol", -1, "of .* must be >= 0; got"),
+        ("picard_steps", np.int64(-1), "must be an integer, 0 or"),
+        ("newton_steps", 2.5, "must be an integer, 0 or"),
+        ("root_find_max_steps", -1, "must be an? "),
+        ("root_finder", ds.PicardNewton, "must be an? "),
+        ("root_finder", None, "must be an? "),
     ):
+        make = ds.ImplicitMidpoint if "root" in name else ds.PicardNewton
         with pytest.raises(ValueError, match=f"`{name}` {says}"):
             make(**{name: wrong})
 

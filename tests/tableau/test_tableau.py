@@ -85,7 +85,6 @@ def test_every_member_of_srkw2_satisfies_all_conditions():
 def test_only_live_distinct_stages_are_solved():
     # The numbers of unknown vectors in each block.
     for solver, numbers in (
-        (ds.SRKs1(a=0.5), [1]),
         (ds.SRKs1(a=0.25), [1, 1]),
         (ds.SRKw1(b=0.2), [2]),
         (ds.SRKw2(), [5, 1]),

@@ -61,7 +61,6 @@ SEPARABLE = {
 NOT_SEPARABLE = {
     "product": lambda t, p, q, a: jnp.sum(p * q),
     "integer": lambda t, p, q, a: jnp.sum(p**2 + q**2) + (1 - a["n"]) * jnp.sum(p * q),
-    "small": lambda t, p, q, a: jnp.sum((p - 1e-30 * q) ** 2 + q**2),
     "mass in time": lambda t, p, q, a: jnp.sum(p**2) * (1 + t) + jnp.sum(q**2),
     "rounded": lambda t, p, q, a: jnp.sum(p**2 + q * jnp.floor(p)),
     "not differentiated": lambda t, p, q, a: jnp.sum(

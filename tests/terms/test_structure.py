@@ -79,7 +79,6 @@ REFUSED = [
     (terms_of(coupled, kicks), "dH0/dq depends on p", True),
     (terms_of(mass_in_time, kicks), "dH0/dp depends on t", True),
     (terms_of(well, momentum), "dH_k/dp is not zero", True),
-    (terms_of(well, coupled), "dH_k/dp is not zero", True),
     # Plain terms are not blamed on a Hamiltonian.
     (BOTH_CHANGE, "a noise term changes q, the second half of the state", False),
     (

@@ -24,7 +24,9 @@ def test_terms_are_the_symplectic_gradients():
     # One noise may be a scalar.
     _, single = ds.hamiltonian_terms(H0, H0, ()).terms
     p, q = np.array([0.3, -0.5]), np.array([0.2, 0.9])
-    t, args, control = 0.4, 1.7, np.array([0.7, -1.1])
+    t = 0.4
+    args = 1.7
+    control = np.array([0.7, -1.1])
 
     @jax.jit
     def fields(p, q):

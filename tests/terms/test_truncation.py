@@ -111,7 +111,8 @@ def assert_moments(y, exact):
 
 def test_the_law_with_additive_noise_is_exact_at_every_step():
     # A linear system, kicked and in a bath: the law is Gaussian, with these moments.
-    h, steps = 2.0, 10
+    h = 2.0
+    steps = 10
     bath = ds.langevin_terms(WELL, 0.5, 1.0, ())
     shaped = diffrax.MultiTerm(*bath.terms, *ds.noise_terms(KICK, ()).terms)
     with warnings.catch_warnings():
