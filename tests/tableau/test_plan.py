@@ -105,14 +105,6 @@ def test_stages_whose_values_cancel_are_left_out():
     assert plan.tableau.matrix.tolist() == [[0.5]] and plan.tableau.weights == 1
 
 
-def test_drift_and_noise_apart_are_one_stage_with_those_together():
-    stages = tuple(Stage(x, 0.5, "y", "y") for x in (("h",), ("W",), BOTH))
-    matrix, weights = np.full((3, 3), 0.25), np.array([0.4, 0.4, 0.6])
-    plan = make_plan(FlatTableau(stages, matrix, weights))
-    assert plan.tableau.stages == stages[2:]
-    assert plan.tableau.matrix == 0.5 and plan.tableau.weights == 1
-
-
 def _check_blocks(plan):
     """That the blocks can be carried out in order, and that the unknowns are as few as
     possible."""

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._tableau import Block, make_plan
+from diffrax_symplectic._tableau import make_plan
 from examples._srkw2 import PaperSRKw2, srkw2_tableau
 
 from ..solver.test_every_solver import TABLE
@@ -82,38 +82,26 @@ def test_every_member_of_srkw2_satisfies_all_conditions():
     assert np.array_equal(solver.matrix, member.matrix)
 
 
-# The numbers of unknown vectors in each block.
-UNKNOWN = [
-    (ds.ImplicitMidpoint(), [1]),
-    (ds.SRKs1(a=0.0), [1]),
-    (ds.SRKs1(a=0.5), [1]),
-    (ds.SRKs1(a=0.25), [1, 1]),
-    (ds.SRKw1(b=0.5), [1]),
-    (ds.SRKw1(b=1.0), [1, 1]),
-    (ds.SRKw1(b=0.2), [2]),
-    (ds.SRKw2(), [5, 1]),
-    (PaperSRKw2(), [6]),
-    (ds.StrangGauss(), [1, 2, 1]),
-    (ds.SRKs2(), [1]),
-    # The noise is read with the force; drift, then kick; kick, then drift.
-    (ds.SRKw3("a"), [1]),
-    (ds.SRKw3("b"), [1, 0]),
-    (ds.SRKw3("c"), [0, 1]),
-    (ds.SRKs3(a=0.25), [1, 1, 0]),
-    (ds.StormerVerlet(), [0, 0, 0]),
-    (ds.PlateauVerlet(), [0] * 12),
-    (ds.SRKw5(), [0, 0, 1]),
-    (ds.SRKs4(), [0, 0, 0, 0, 1, 1]),
-]
-
-
 def test_only_live_distinct_stages_are_solved():
-    for solver, numbers in UNKNOWN:
+    # The numbers of unknown vectors in each block.
+    for solver, numbers in (
+        (ds.SRKs1(a=0.25), [1, 1]),
+        (ds.SRKw1(b=0.2), [2]),
+        (ds.SRKw2(), [5, 1]),
+        (PaperSRKw2(), [6]),
+        (ds.StrangGauss(), [1, 2, 1]),
+        # The noise is read with the force; drift, then kick; kick, then drift.
+        (ds.SRKw3("a"), [1]),
+        (ds.SRKw3("b"), [1, 0]),
+        (ds.SRKw3("c"), [0, 1]),
+        (ds.PlateauVerlet(), [0] * 12),
+        (ds.SRKs4(), [0, 0, 0, 0, 1, 1]),
+    ):
         blocks = make_plan(solver.tableau.flatten()).blocks
         assert [sum(map(len, b.unknown)) for b in blocks] == numbers, solver
 
 
-def test_parameters_that_are_none_are_refused():
+def test_parameters_and_tableaus_that_are_none_are_refused():
     for make, name in (
         *((ds.SRKs1, "a"), (ds.SRKw1, "b"), (ds.SRKw4, "a21"), (ds.SRKs3, "a")),
         *((ds.SRKs4, name) for name in ("beta1", "beta2", "b")),
@@ -129,28 +117,33 @@ def test_parameters_that_are_none_are_refused():
     for sign in (0, 2, True, 0.5, "-"):
         with pytest.raises(ValueError, match="`sign` must be 1 or -1"):
             ds.SRKs4(sign=sign)
-
-
-def test_explicit_stages_never_reach_the_root_finder():
-    # An explicit trapezoidal rule is not symplectic, but must be recognised.
-    A = [[0.0, 0.0], [1.0, 0.0]]
-    heun = ds.GeneralTableau.strong(A=A, B=A, alpha=[0.5, 0.5], beta=[0.5, 0.5])
-    plan = make_plan(heun.flatten())
-    assert plan.blocks == (Block((), ((0,),)), Block((), ((1,),)))
-    assert np.max(np.abs(ds.symplectic_residuals(heun))) > 0.1
-
-
-def test_malformed_tableaus_are_refused():
+    tableau = ds.ImplicitMidpoint().tableau
     for change, message in (
         (dict(A0=np.ones((2, 2))), r"`A0` must have shape \(1, 1\)"),
         (dict(beta=[np.nan]), "`beta` must be finite"),
         (dict(alpha=[1j]), "`alpha` must be real"),
+        (dict(noise="W"), "`noise` must hold the names"),
+        (dict(noise=[0]), "`noise` must hold the names"),
+        (dict(noise=("W", "bogus")), "names among .*'W'.*; got 'bogus'."),
     ):
         with pytest.raises(ValueError, match=message):
-            dataclasses.replace(ds.ImplicitMidpoint().tableau, **change)
+            dataclasses.replace(tableau, **change)
+    assert dataclasses.replace(tableau, noise=["W"]).noise == ("W",)
 
 
-def test_weak_order_residuals_know_orders_one_and_two():
+RESIDUALS = [
+    ds.strong_order_residuals,
+    lambda x: ds.weak_order_residuals(x, 1),
+    lambda x: ds.weak_order_residuals(x, 2),
+]
+
+
+def test_general_conditions_are_refused_unless_the_increment_drives_the_noise():
+    for noise in (("W", "H"), ("H",), ("A",), ("W", "W"), ("two_point",)):
+        tableau = dataclasses.replace(ds.SRKw2().tableau, noise=noise)
+        for residuals in RESIDUALS:
+            with pytest.raises(ValueError, match=r'variable "W", .*weak_order_defect'):
+                residuals(tableau)
     with pytest.raises(ValueError, match="`order` must be 1 or 2"):
         ds.weak_order_residuals(ds.ImplicitMidpoint().tableau, 3)
 
@@ -160,10 +153,7 @@ def test_conditions_are_known_for_known_tableaus_and_variables():
         def flatten(self):
             return ds.ImplicitMidpoint().tableau.flatten()
 
-    for residuals in (
-        ds.strong_order_residuals,
-        lambda x: ds.weak_order_residuals(x, 1),
-    ):
+    for residuals in RESIDUALS:
         with pytest.raises(ValueError, match="got `Other`"):
             residuals(Other())
 
@@ -203,25 +193,3 @@ def test_strong_order_three_halves_has_no_place_for_further_variables():
         [1], {"W": [1], "sign": [1]}, [[0.5]], {"W": [[0.5]]}, [0.5]
     )
     assert ds.strong_order_residuals(in_time)["beta[sign].c1"] == 0.5
-
-
-def test_noise_of_a_tableau_is_a_tuple_of_names():
-    one = dict(alpha=[1], beta=[1], A0=[[0.5]], B0=[[0.5]], A1=[[0.5]], B1=[[0.5]])
-    assert ds.GeneralTableau(**one, noise=["W"]).noise == ("W",)
-    for wrong in ("W", [0]):
-        with pytest.raises(ValueError, match="`noise` must hold the names"):
-            ds.GeneralTableau(**one, noise=wrong)
-    with pytest.raises(ValueError, match="names among .*'W'.*; got 'bogus'."):
-        ds.GeneralTableau(**one, noise=("W", "bogus"))
-
-
-def test_general_conditions_are_refused_unless_the_increment_drives_the_noise():
-    for noise in (("W", "H"), ("H",), ("A",), ("W", "W"), ("two_point",)):
-        tableau = dataclasses.replace(ds.SRKw2().tableau, noise=noise)
-        for residuals in (
-            ds.strong_order_residuals,
-            lambda x: ds.weak_order_residuals(x, 1),
-            lambda x: ds.weak_order_residuals(x, 2),
-        ):
-            with pytest.raises(ValueError, match=r'variable "W", .*weak_order_defect'):
-                residuals(tableau)

@@ -29,14 +29,6 @@ def _over_sites(t, p, q, args):
     return jax.lax.scan(add, jnp.zeros(()), (p, q))[0]
 
 
-@jax.custom_jvp
-def _quartic(x):
-    return jnp.sum(x**4)
-
-
-_quartic.defjvp(lambda x, t: (_quartic(*x), jnp.sum(4 * x[0] ** 3 * t[0])))
-
-
 def _checked(t, p, q, args):
     p = eqx.error_if(p, jnp.any(p > 1e9), "too fast")
     return jnp.sum(p**2) + jnp.sum(jnp.sin(q))
@@ -48,15 +40,10 @@ SEPARABLE = {
     "network": lambda t, p, q, a: jnp.sum(p**2) + _network(q),
     "cond": lambda t, p, q, a: jax.lax.cond(
         a["k"] > 0,
-        lambda p, q: jnp.sum(p**2 + jnp.cos(q)),
-        lambda p, q: jnp.sum(p**4 + jnp.sin(q)),
-        p,
-        q,
+        lambda: jnp.sum(p**2 + jnp.cos(q)),
+        lambda: jnp.sum(p**4 + jnp.sin(q)),
     ),
     "scan": _over_sites,
-    "loop": lambda t, p, q, a: jax.lax.fori_loop(
-        0, 2, lambda i, s: s + p[i] ** 2 / 2 + jnp.cos(q[i]), 0.0
-    ),
     "vmap": lambda t, p, q, a: jnp.sum(
         jax.vmap(lambda p, q, m: p**2 / m - jnp.cos(q))(p, q, a["m"])
     ),
@@ -68,18 +55,12 @@ SEPARABLE = {
     "checkpoint": lambda t, p, q, a: jax.checkpoint(
         lambda p, q: jnp.sum(jnp.sin(p)) + jnp.sum(jnp.exp(q))
     )(p, q),
-    "own derivative": lambda t, p, q, a: _quartic(p) + _quartic(q),
-    "stacked": lambda t, p, q, a: jnp.sum(jnp.stack([p**2, jnp.cos(q)])),
     "checked": _checked,
     "shapes": lambda t, p, q, a: jnp.sum(p**2) * q.size + jnp.sum(q**2) * len(p),
 }
 NOT_SEPARABLE = {
     "product": lambda t, p, q, a: jnp.sum(p * q),
     "integer": lambda t, p, q, a: jnp.sum(p**2 + q**2) + (1 - a["n"]) * jnp.sum(p * q),
-    "Boolean": lambda t, p, q, a: (
-        jnp.sum(p**2 + q**2) + jnp.where(a["n"] > 0, 0.0, 1.0) * jnp.sum(p * q)
-    ),
-    "small": lambda t, p, q, a: jnp.sum((p - 1e-30 * q) ** 2 + q**2),
     "mass in time": lambda t, p, q, a: jnp.sum(p**2) * (1 + t) + jnp.sum(q**2),
     "rounded": lambda t, p, q, a: jnp.sum(p**2 + q * jnp.floor(p)),
     "not differentiated": lambda t, p, q, a: jnp.sum(
@@ -92,10 +73,7 @@ NOT_SEPARABLE = {
         lambda s, x: (s * x[0] + x[1], None), 1.0, (p, q)
     )[0],
     "cancels": lambda t, p, q, a: jnp.sum((p - q) ** 2 / 2 + p * q),
-    "overlapping": lambda t, p, q, a: jnp.sum(jnp.concatenate([p, q])[1:3]) ** 2,
-    "columns": lambda t, p, q, a: jnp.sum(
-        jnp.sum(jnp.concatenate([p, q]).reshape(2, 2), 0) ** 2
-    ),
+    "columns": lambda t, p, q, a: jnp.sum(jnp.sum(jnp.stack([p, q]), 0) ** 2),
     # Separable, which dead-code elimination does not see.
     "packed": lambda t, p, q, a: jnp.sum(jnp.concatenate([p, q]) ** 2),
     "zero coupling": lambda t, p, q, a: jnp.sum(p**2 + q**2) + 0.0 * jnp.sum(p * q),
@@ -104,15 +82,8 @@ NOISES = {
     # Whether they are additive, and constant.
     "constant kick": (lambda t, p, q, a: -a["k"] * jnp.sum(q), True, True),
     "matrix": (lambda t, p, q, a: jnp.sum(a["K"] @ q - K @ p), True, True),
-    "scan": (
-        lambda t, p, q, a: jax.lax.scan(lambda s, x: (s + x, None), 0.0, q)[0],
-        True,
-        True,
-    ),
     "in time": (lambda t, p, q, a: jnp.cos(t) * jnp.sum(q), True, False),
     "square": (lambda t, p, q, a: jnp.sum(q**2), False, True),
-    "absolute value": (lambda t, p, q, a: jnp.sum(jnp.abs(q)), False, True),
-    "maximum": (lambda t, p, q, a: jnp.max(q), False, True),
     "cancels": (lambda t, p, q, a: jnp.sum((p + q) ** 2 - p**2 - q**2), False, True),
 }
 Y0 = (jnp.array([0.3, 0.1]), jnp.array([0.5, -0.2]))
@@ -129,24 +100,22 @@ _potential = lambda t, p, q, args: jnp.sum(jnp.sin(q)) * jnp.cos(t)
 @pytest.mark.parametrize("H0", SEPARABLE.values(), ids=SEPARABLE.keys())
 def test_ordinary_separable_hamiltonians_are_recognised(H0):
     # Also if the arguments are traced, and nothing is run.
-    fault = jax.eval_shape(
-        lambda args: separable_fault(*_terms(H0, _potential), 0.0, Y0, args), ARGS
-    )
+    terms = _terms(H0, _potential)
+    fault = jax.eval_shape(lambda args: separable_fault(*terms, 0.0, Y0, args), ARGS)
     assert fault is None
 
 
 @pytest.mark.parametrize("H0", NOT_SEPARABLE.values(), ids=NOT_SEPARABLE.keys())
 def test_what_may_not_be_separable_is_refused(H0):
     assert separable_fault(*_terms(H0, _potential), 0.0, Y0, ARGS) is not None
-    assert separable_fault(*_terms(SEPARABLE["scan"], H0), 0.0, Y0, ARGS) is not None
+    assert separable_fault(*_terms(_over_sites, H0), 0.0, Y0, ARGS) is not None
 
 
-@pytest.mark.parametrize("name", NOISES)
-def test_additive_and_constant_noise_is_recognised(name):
-    H, additive, constant = NOISES[name]
-    _, noise = _terms(_over_sites, H)
-    assert (additive_fault(noise, 0.0, Y0, ARGS) is None) == additive
-    assert (constant_fault(noise, 0.0, Y0, ARGS) is None) == constant
+def test_additive_and_constant_noise_is_recognised():
+    for name, (H, additive, constant) in NOISES.items():
+        _, noise = _terms(_over_sites, H)
+        assert (additive_fault(noise, 0.0, Y0, ARGS) is None) == additive, name
+        assert (constant_fault(noise, 0.0, Y0, ARGS) is None) == constant, name
 
 
 _count = lambda n, f, x: jax.lax.while_loop(
@@ -157,15 +126,7 @@ PROGRAMS = {
     "repeated": (lambda x, y: _count(3, lambda s: 2 * s, y), True),
     "repeated as often as x says": (lambda x, y: _count(x, lambda s: 2 * s, y), False),
     "read in a loop": (lambda x, y: _count(3, lambda s: s + x, y), False),
-    "carried from one to the other": (
-        lambda x, y: jax.lax.fori_loop(0, 3, lambda i, s: (s[1], s[2], x), (y, y, y))[
-            0
-        ],
-        False,
-    ),
-    "zeros plus": (lambda x, y: jnp.zeros(2) + x, False),
     "chosen branch": (lambda x, y: jax.lax.cond(x > 0, jnp.sin, jnp.cos, y), False),
-    "sign": (lambda x, y: y + jnp.sign(x), False),
     "call back": (
         lambda x, y: jax.pure_callback(
             lambda v: v, jax.ShapeDtypeStruct((), float), x, vmap_method="sequential"
@@ -175,49 +136,37 @@ PROGRAMS = {
 }
 
 
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_dependence_through_programs(name):
-    fn, independent = PROGRAMS[name]
-    flow = Dependence(fn, jnp.array(0.5), jnp.array(0.3))
-    assert flow.independent(lambda x, y: x) == independent
-    wrapped = Dependence(jax.jit(jax.vmap(fn)), jnp.ones(3), jnp.ones(3))
-    assert wrapped.independent(lambda x, y: x) == independent
+def test_dependence_through_programs():
+    for name, (fn, independent) in PROGRAMS.items():
+        flow = Dependence(fn, jnp.array(0.5), jnp.array(0.3))
+        assert flow.independent(lambda x, y: x) == independent, name
+        wrapped = Dependence(jax.jit(jax.vmap(fn)), jnp.ones(3), jnp.ones(3))
+        assert wrapped.independent(lambda x, y: x) == independent, name
 
 
 _MASSES = jnp.array([1.0, 2.0, 4.0])
 
 
-@pytest.mark.parametrize(
-    "kinetic, diagonal",
-    [
-        (lambda p: jnp.sum(p**2) / 2, True),
-        (lambda p: p @ p / 2, True),
-        (lambda p: jnp.sum(p**2 / (2 * _MASSES)), True),
-        (lambda p: jnp.vdot(p, p / _MASSES) / 2, True),
-        (lambda p: jnp.sum(jax.jit(jnp.square)(p)) / 2, True),
-        (lambda p: jnp.sum(jnp.where(_MASSES > 1, p, 2 * p) ** 2), True),
-        # Some are so, but not known to be.
-        (lambda p: jnp.einsum("i,i,i", p, p, 1 / _MASSES) / 2, False),
-        (lambda p: sum(p[i] ** 2 for i in range(3)) / 2, False),
-        (lambda p: p @ (jnp.diag(_MASSES) + 0.1) @ p / 2, False),
-        (lambda p: jnp.sum(jnp.diff(p) ** 2), False),
-        (lambda p: jnp.sum(p) ** 2 / 2, False),
-        (lambda p: jnp.sum(p * p[::-1]), False),
-        (
-            lambda p: jnp.sum(p**2 * _MASSES[:, None]) + jnp.sum(jnp.cumsum(p) ** 2),
-            False,
-        ),
-    ],
-)
-def test_kinetic_energies_of_diagonal_masses_are_known(kinetic, diagonal):
-    velocity = jax.grad(kinetic)
-    assert acts_elementwise(velocity, jnp.ones(3)) is diagonal
-    mass = jax.jacobian(velocity)(jnp.ones(3))
-    is_diagonal = jnp.allclose(mass, jnp.diag(jnp.diag(mass)))
-    assert is_diagonal or not diagonal
+KINETIC = [
+    (lambda p: p @ p / 2, True),
+    (lambda p: jnp.vdot(p, p / _MASSES) / 2, True),
+    (lambda p: jnp.sum(jax.jit(jnp.square)(p)) / 2, True),
+    (lambda p: jnp.sum(jnp.where(_MASSES > 1, p, 2 * p) ** 2), True),
+    # The first two are so, but not known to be.
+    (lambda p: jnp.einsum("i,i,i", p, p, 1 / _MASSES) / 2, False),
+    (lambda p: sum(p[i] ** 2 for i in range(3)) / 2, False),
+    (lambda p: p @ (jnp.diag(_MASSES) + 0.1) @ p / 2, False),
+    (lambda p: jnp.sum(jnp.diff(p) ** 2), False),
+    (lambda p: jnp.sum(p) ** 2 / 2, False),
+    (lambda p: jnp.sum(p * p[::-1]), False),
+    (lambda p: jnp.sum(p**2 * _MASSES[:, None]) + jnp.sum(jnp.cumsum(p) ** 2), False),
+]
 
 
-def test_arrays_of_a_tree_that_mix_do_not_act_entry_by_entry():
+def test_kinetic_energies_of_diagonal_masses_are_known():
+    for kinetic, diagonal in KINETIC:
+        assert acts_elementwise(jax.grad(kinetic), jnp.ones(3)) is diagonal
+    # Arrays of a tree that mix do not act entry by entry.
     p = {"a": jnp.ones(3), "b": jnp.ones(3)}
     apart = lambda p: {"a": 2 * p["a"], "b": p["b"] / _MASSES}
     mixed = lambda p: {"a": p["a"] + p["b"], "b": p["b"]}

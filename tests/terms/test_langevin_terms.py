@@ -1,11 +1,8 @@
 """Friction and temperature as terms: every solver sees them, in every form."""
 
-import itertools
-
 import diffrax
 import equinox as eqx
 import jax
-import jax.flatten_util as jfu
 import jax.numpy as jnp
 import jax.random as jr
 import lineax as lx
@@ -15,7 +12,6 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._terms import semidefinite_root
 
-from ..families import slow_except
 from ..problems import as_friction, Given, weak_path
 
 
@@ -54,34 +50,41 @@ FRICTIONS = {
 }
 
 
-@pytest.mark.parametrize("name", FRICTIONS)
-def test_drift_and_noise_are_those_of_the_equation(name):
-    friction, matrix = FRICTIONS[name]
-    m = 2 if "along" in name else 3
-    terms = ds.langevin_terms(_pendula, friction, T, (m,))
-    drift, noise = terms.terms
-    alone, of_bath = ds.bath_terms(_pendula, friction, T, (m,)).terms
-    assert type(noise) is type(of_bath)
-    control = np.arange(1.0, m + 1)
+def test_drift_and_noise_are_those_of_the_equation():
+    numbers = {name: 2 if "along" in name else 3 for name in FRICTIONS}
+    controls = {name: np.arange(1.0, m + 1) for name, m in numbers.items()}
+    made = {
+        name: (
+            ds.langevin_terms(_pendula, friction, T, (numbers[name],)).terms,
+            ds.bath_terms(_pendula, friction, T, (numbers[name],)).terms,
+        )
+        for name, (friction, _) in FRICTIONS.items()
+    }
+    assert all(type(of[1]) is type(of_bath[1]) for of, of_bath in made.values())
 
     @jax.jit
     def fields(p, q):
         at = 0.3, (p, q), None
-        drifts = [
-            x.vf(*at) for x in (alone, *ds.hamiltonian_terms(_pendula).terms, drift)
-        ]
-        return drifts, noise.vf(*at), noise.vf_prod(*at, control)
 
-    p, q = np.asarray(jr.normal(jr.key(0), (2, 3)))
-    drifts, (B, still), kick = jax.tree.map(np.asarray, fields(p, q))
-    (dp, dq), (forces, velocities), both = drifts
-    G = matrix(q)
-    np.testing.assert_allclose(dp, -G @ (p / MASSES), rtol=1e-14)
-    np.testing.assert_array_equal(dq, 0)
-    np.testing.assert_allclose(both, (forces + dp, velocities), rtol=1e-14)
-    np.testing.assert_allclose(B @ B.T, 2 * T * G, atol=1e-14)
-    np.testing.assert_array_equal(still, 0)
-    np.testing.assert_allclose(kick, (B @ control, still @ control), atol=1e-14)
+        def of_each(name):
+            (drift, noise), (alone, _) = made[name]
+            kick = noise.vf_prod(*at, controls[name])
+            return alone.vf(*at), drift.vf(*at), noise.vf(*at), kick
+
+        return ds.hamiltonian_terms(_pendula).terms[0].vf(*at), {
+            name: of_each(name) for name in made
+        }
+
+    p, q = np.random.default_rng(0).normal(size=(2, 3))
+    (forces, velocities), results = jax.tree.map(np.asarray, fields(p, q))
+    for name, ((dp, dq), both, (B, still), kick) in results.items():
+        G = FRICTIONS[name][1](q)
+        np.testing.assert_allclose(dp, -G @ (p / MASSES), rtol=1e-14)
+        np.testing.assert_array_equal(dq, 0)
+        np.testing.assert_allclose(both, (forces + dp, velocities), rtol=1e-14)
+        np.testing.assert_allclose(B @ B.T, 2 * T * G, atol=1e-14)
+        np.testing.assert_array_equal(still, 0)
+        np.testing.assert_allclose(kick, (B @ controls[name], 0 * q), atol=1e-14)
 
 
 def test_momenta_in_trees_have_frictions_and_temperatures_in_trees():
@@ -105,43 +108,18 @@ def test_momenta_in_trees_have_frictions_and_temperatures_in_trees():
         np.testing.assert_allclose(dp["b"], forces[1])
         np.testing.assert_allclose(B["a"] @ B["a"].T, squares[0], atol=1e-14)
         np.testing.assert_allclose(B["b"] @ B["b"], squares[1])
-    # Directions couple the arrays of a tree.
+    # Directions couple the arrays of a tree, and conserve the total momentum.
     along = {"a": jnp.ones((3, 1)), "b": -3 * jnp.ones(1)}
-    friction = ds.FrictionAlong(along)
-    force, _ = ds.bath_terms(H0, friction, T, (1,)).terms
+    force, _ = ds.bath_terms(H0, ds.FrictionAlong(along), T, (1,)).terms
     (dp,) = fields(force)
     # The velocities 0, 0.5, 1 and 2.
     np.testing.assert_allclose([*dp["a"], dp["b"]], 4.5 * np.array([1, 1, 1, -3]))
-    y0 = p, p
     with pytest.raises(ValueError, match="besides friction"):
-        ds.BAOAB().init(force, 0.0, 0.1, y0, None)
-    terms = diffrax.MultiTerm(*ds.hamiltonian_terms(H0).terms, force)
-
-    @jax.jit
-    def step(y0):
-        state = ds.BAOAB().init(terms, 0.0, 0.1, y0, None)
-        return ds.BAOAB().step(terms, 0.0, 0.1, y0, None, state, False)[0]
-
-    p1, _ = step(y0)
-    np.testing.assert_allclose(np.sum(p1["a"]) + p1["b"], 5.0, rtol=1e-15)
-
-
-def test_friction_between_particles_conserves_momentum():
-    # The root of a rounding error in the singular matrix is no noise.
-    n = 6
-    G = n * jnp.eye(n) - jnp.ones((n, n))
-    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2
-    y0 = jnp.arange(n) / n, jnp.zeros(n)
-    for friction in (as_friction(G), lambda t, q, args: as_friction(G)):
-        terms = ds.langevin_terms(H0, friction, 1.0, weak_path(n))
-        options = dict(max_steps=None, adjoint=diffrax.ForwardMode())
-        sol = diffrax.diffeqsolve(terms, ds.BAOAB(), 0, 1000, 0.1, y0, **options)
-        np.testing.assert_allclose(jnp.sum(sol.ys[0]), (n - 1) / 2, atol=1e-13 * n)
-        assert np.std(sol.ys[0]) > 0.1
+        ds.BAOAB().init(force, 0.0, 0.1, (p, p), None)
 
 
 # Lengths and ranks of the factors of semidefinite matrices.
-@pytest.mark.parametrize("n, rank", [(2, 1), (8, 8), (20, 7)])
+@pytest.mark.parametrize("n, rank", [(8, 8), (20, 7)])
 def test_roots_of_semidefinite_matrices_are_roots(n, rank):
     # In single precision, too, and with entries of very different size.
     X = jr.normal(jr.key(n), (n, rank)) * jnp.logspace(0, -6, n)[:, None]
@@ -154,6 +132,15 @@ def test_roots_of_semidefinite_matrices_are_roots(n, rank):
         most = 50 if rank == n else np.finfo(dtype).eps ** -0.5
         assert np.max(error) <= most * n * np.finfo(dtype).eps
         np.testing.assert_allclose(L, np.tril(L))
+    # The root of a multiple is a multiple of the root.
+    slope = jax.jit(jax.grad(lambda a: jnp.sum(semidefinite_root(a * A))))(1.0)
+    np.testing.assert_allclose(slope, np.sum(L) / 2, rtol=1e-4)
+
+
+def test_the_root_of_a_rounding_error_in_a_singular_matrix_is_no_noise():
+    # Friction between each two of six particles conserves the total momentum.
+    L = semidefinite_root(6 * jnp.eye(6) - jnp.ones((6, 6)))
+    np.testing.assert_allclose(np.sum(L, axis=0), 0, atol=1e-14)
 
 
 def test_other_matrices_have_no_root():
@@ -236,33 +223,18 @@ def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
     for arguments, match in (
         ((-1.0, T, (3,)), "`friction` must be a real number.*not negative; got -1.0"),
         ((np.nan, T, (3,)), "`friction` must be .*finite"),
-        ((1j, T, (3,)), "`friction` must be a real number"),
-        (("much", T, (3,)), "`friction` must be a real number"),
-        ((True, T, (3,)), "`friction` must be a real number"),
         ((None, T, (3,)), "`friction` must be a number"),
-        (
-            (jnp.ones(2), T, (3,)),
-            r"the shape of the `path` and the momenta, \(3,\).*got shape \(2,\)",
-        ),
+        ((jnp.ones(2), T, (3,)), r"and the momenta, \(3,\).*got shape \(2,\)"),
         ((jnp.eye(3), T, (3,)), r"Pass a matrix as `lineax.MatrixLinearOperator"),
-        (
-            (as_friction(jnp.eye(4)), T, (2,)),
-            r"the shape of the `path` and the momenta, \(2,\); got one for shape \(4,\)",
-        ),
+        ((as_friction(jnp.eye(4)), T, (2,)), r"\(2,\); got one for shape \(4,\)"),
         ((lx.MatrixLinearOperator(TENSOR), T, (3,)), "tagged as positive semidefinite"),
         (([1.0, 0, 1.0], T, (3,)), r"got \[1.0, 0, 1.0\]. .*`jnp.array\(friction\)`"),
         ((as_friction(negative),), "`friction` must be a symmetric positive semidef"),
-        (
-            (as_friction(jnp.abs(negative)), T, (2,)),
-            "must be a symmetric positive semi",
-        ),
         (({"a": 1.0}, T, (3,)), "`friction` must be .* structure of the momenta"),
         ((lambda q: 1.0, T, (3,)), r"`friction\(t, q, args\)`"),
         ((1.0, -T, (3,)), "`temperature` must be a real number.*not negative"),
-        ((1.0, "hot", (3,)), "`temperature` must be"),
         ((1.0, lambda t: 1.0, (3,)), r"`temperature\(t, q, args\)`"),
         ((1.0, T), "both a `temperature` and a `path`"),
-        ((1.0, None, (3,)), "both a `temperature` and a `path`"),
         ((1.0, T, 3), "`path` must be a Brownian path"),
         ((ds.FrictionAlong(lambda q: q), T, (3,)), r"`directions\(t, q, args\)`"),
     ):
@@ -270,23 +242,16 @@ def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
             make(*arguments)
     y0 = jnp.ones(3), jnp.ones(3)
     along = ds.FrictionAlong(jnp.ones((3, 2)))
+    untagged = lambda t, q, args: lx.MatrixLinearOperator(TENSOR)
     for arguments, match in (
         ((1.0, T, weak_path(2)), r"must have the shape of `q`, \(3,\)"),
         ((along, T, weak_path(3)), r"one noise for each direction.* shape \(2,\)"),
         ((ds.FrictionAlong(jnp.ones(3)), T, weak_path(3)), "and one more axis"),
         ((along, jnp.ones(2), weak_path(2)), "`temperature` must be one number"),
-        (
-            (as_friction(TENSOR), jnp.ones(3), weak_path(3)),
-            "`temperature` must be one number",
-        ),
         ((1.0, jnp.ones(2), weak_path(3)), "array of `temperature` must have"),
         ((lambda t, q, args: q[:2], T, weak_path(3)), "array of `friction` must have"),
-        (([1.0, 0, 1.0],), r"`jnp.array\(friction\)`"),
         ((1.0, [T] * 3, weak_path(3)), r"`jnp.array\(temperature\)`"),
-        (
-            (lambda t, q, args: lx.MatrixLinearOperator(TENSOR), T, weak_path(3)),
-            "tagged as positive semidefinite",
-        ),
+        ((untagged, T, weak_path(3)), "tagged as positive semidefinite"),
     ):
         with pytest.raises(ValueError, match=match):
             ds.BAOAB().init(make(*arguments), 0.0, 0.1, y0, None)
@@ -295,146 +260,78 @@ def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
 def test_numbers_for_each_particle_are_repeated_along_the_axes_of_space():
     masses = jnp.arange(1.0, 5.0)[:, None]
     H0 = lambda t, p, q, args: jnp.sum(p**2 / masses) / 2 + jnp.sum(q**2)
-    y0 = np.ones((4, 3)), np.ones((4, 3))
-    path = ds.WeakBrownianPath((4, 3), jr.key(0))
+    ones = np.ones((4, 3))
 
     def fields(friction, temperature):
-        force, noise = ds.bath_terms(H0, friction, temperature, path).terms
+        terms = ds.bath_terms(H0, friction, temperature, (4, 3)).terms
+        return [term.vf(0.0, (ones, ones), None)[0] for term in terms]
 
-        @jax.jit
-        def both(y0):
-            kick = noise.vf_prod(0.0, y0, None, np.ones((4, 3)))
-            return force.vf(0.0, y0, None)[0], kick[0]
-
-        return both(y0)
-
-    whole = masses * jnp.ones((4, 3))
-    for friction in (masses, lambda t, q, args: masses):
-        got = fields(friction, masses / 2)
-        np.testing.assert_array_equal(got, fields(whole, whole / 2))
+    at_q = lambda t, q, args: masses
+    whole = masses * ones
+    given = (masses, masses / 2), (at_q, masses / 2), (whole, whole / 2)
+    *others, expected = jax.jit(lambda: [fields(*pair) for pair in given])()
+    for other in others:
+        jax.tree.map(np.testing.assert_array_equal, other, expected)
     # One number for each axis, or for each particle: which of them is meant?
-    for given in (masses[:, 0], lambda t, q, args: masses[:, 0]):
+    for wrong in (masses[:, 0], lambda t, q, args: masses[:, 0]):
         with pytest.raises(ValueError, match=r"pass `friction\[:, None\]`"):
-            fields(given, 1.0)
+            fields(wrong, 1.0)
         with pytest.raises(ValueError, match=r"pass `temperature\[:, None\]`"):
-            fields(1.0, given)
+            fields(1.0, wrong)
 
 
-@pytest.mark.slow
 def test_a_matrix_for_momenta_with_two_axes_is_an_operator_on_their_structure():
-    n, d = 2, 3
-    flat = jr.normal(jr.key(5), (n * d, n * d))
-    flat = flat @ flat.T
-    q = jr.normal(jr.key(6), (n, d))
-    struct = jax.eval_shape(lambda: q)
-    tag = lx.positive_semidefinite_tag
-    operator = lx.PyTreeLinearOperator(flat.reshape(n, d, n, d), struct, tag)
+    rng = np.random.default_rng(0)
+    root, p = rng.normal(size=(6, 6)), rng.normal(size=(2, 3))
+    G = root @ root.T
+    struct = jax.ShapeDtypeStruct((2, 3), float)
+    operator = lx.PyTreeLinearOperator(
+        jnp.array(G.reshape(2, 3, 2, 3)), struct, lx.positive_semidefinite_tag
+    )
     H0 = lambda t, p, q, args: jnp.sum(p**2) / 2
-    force, noise = ds.bath_terms(H0, operator, T, (n, d)).terms
-    dp, _ = force.vf(0.0, (q, q), None)
-    np.testing.assert_allclose(dp.ravel(), -flat @ q.ravel(), rtol=1e-13)
-    B, _ = noise.vf(0.0, (q, q), None)
-    B = B.reshape(n * d, n * d)
-    np.testing.assert_allclose(B @ B.T, 2 * T * flat, atol=1e-13)
+    terms = ds.bath_terms(H0, operator, T, (2, 3)).terms
+    dp, B = jax.jit(lambda y: [term.vf(0.0, y, None)[0] for term in terms])((p, p))
+    np.testing.assert_allclose(dp, -(G @ p.ravel()).reshape(2, 3), rtol=1e-13)
+    B = B.reshape(6, 6)
+    np.testing.assert_allclose(B @ B.T, 2 * T * G, atol=1e-12)
 
 
-# Of a friction or temperature that is zero for some momenta or somewhere.
-PAIR = jnp.array([[1.0, -1.0, 0.0], [-1.0, 1.0, 0.0], [0.0, 0.0, 0.0]])
-
-
-MANY = 17
-
-
-# The friction and the temperature as functions of a number. Both are zero somewhere.
-ZERO_SOMEWHERE = {
-    "number": (lambda a: a, lambda a: a * jnp.array([1.0, 0.0, 2.0])),
-    "no temperature": (lambda a: a, lambda a: 0 * a),
-    "array": (lambda a: a * jnp.array([1.0, 0.0, 2.0]), lambda a: a),
-    "matrix": (lambda a: as_friction(a * PAIR), lambda a: a),
-    "zero matrix": (lambda a: as_friction(0 * a * PAIR), lambda a: a),
-    "large matrix": (
-        lambda a: as_friction(a * jnp.zeros((MANY, MANY)).at[:3, :3].set(PAIR)),
-        lambda a: a,
-    ),
-    "wall": (lambda a: lambda t, q, args: a * jnp.maximum(q - 1, 0), lambda a: a),
-    "matrix at q": (
-        lambda a: lambda t, q, args: as_friction(a * jnp.maximum(q[2] - 1, 0) * PAIR),
-        lambda a: a,
-    ),
-    "heated side": (
-        lambda a: a,
-        lambda a: lambda t, q, args: a * jnp.maximum(q - 1, 0),
-    ),
-    "tree": (
-        lambda a: {"x": a * jnp.array([1.0, 0.0]), "y": 0 * a},
-        lambda a: {"x": a, "y": a},
-    ),
-    "along": (
-        lambda a: ds.FrictionAlong(a * jnp.array([[1.0, 0.0], [-1.0, 0.0], [0, 0]])),
-        lambda a: 0 * a,
-    ),
-}
-
-
-def _energy(t, p, q, args):
-    momenta = jax.tree.leaves(p)
-    positions = jax.tree.leaves(q)
-    kinetic = sum(jnp.sum(x**2) for x in momenta) / 2
-    return kinetic + sum(jnp.sum(jnp.cos(x)) for x in positions)
-
-
-def _start(name, shift):
-    """Positions on both sides of the wall."""
-    number = MANY if name == "large matrix" else 3
-    p = jnp.linspace(0.3, 0.5, number)
-    q = jnp.linspace(0.2, 1.7, number) + shift
-    if name != "tree":
-        return p, q
-    return tuple({"x": x[:2], "y": x[2]} for x in (p, q))
-
-
-QUICK = [(ds.BAOAB(), "matrix")]
-
-
-# Each of the others once, with the one or the other solver in turn.
-OTHERS = zip(itertools.cycle([ds.BAOAB(), ds.ImplicitMidpoint()]), ZERO_SOMEWHERE)
-
-
-ALL = [*QUICK, *(case for case in OTHERS if case not in QUICK)]
-
-
-@pytest.mark.parametrize("case", slow_except(QUICK, ALL), ids=str)
-def test_derivatives_by_roots_of_zero_are_finite_and_those_of_differences(case):
-    solver, name = case
-    friction, temperature = ZERO_SOMEWHERE[name]
+def test_derivatives_by_roots_of_zero_are_finite_and_those_of_differences():
+    # Three baths whose friction is zero along some direction, or on one side of a wall.
+    pair = jnp.array([[1.0, -1.0], [-1.0, 1.0]])
+    directions = jnp.array([[1.0, 0.0], [-1.0, 0.0]])
+    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 + jnp.sum(jnp.cos(q))
+    solver = ds.BAOAB()
 
     def end(x):
         a, shift = x
-        y0 = _start(name, shift)
-        # One increment for each momentum, or for each direction.
-        like = jnp.zeros(2) if name == "along" else y0[1]
-        flat, unravel = jfu.ravel_pytree(like)
-        noise = unravel(0.3 * jnp.cos(7.0 * jnp.arange(flat.size)))
-        terms = ds.langevin_terms(_energy, friction(a), temperature(a), Given(noise))
+        wall = lambda t, q, args: a * jnp.maximum(q - 1, 0)
+        noises = [Given(jnp.array(x)) for x in ([0.3, 0.2], [-0.1, 0.4], [0.2, 0.1])]
+        terms = diffrax.MultiTerm(
+            *ds.langevin_terms(H0, as_friction(a * pair), a, noises[0]).terms,
+            *ds.bath_terms(H0, wall, a * jnp.array([0.0, 2.0]), noises[1]).terms,
+            *ds.bath_terms(
+                H0, ds.FrictionAlong(a * directions), 0 * a, noises[2]
+            ).terms,
+        )
+        y0 = jnp.array([0.3, 0.5]), jnp.array([0.2, 1.7]) + shift
         state = solver.init(terms, 0.0, 0.3, y0, None)
         y1, *_ = solver.step(terms, 0.0, 0.3, y0, None, state, False)
-        return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(y1))
+        return jnp.sum(jnp.sin(jnp.stack(y1)))
 
-    points = np.array([[0.7, 0.0], [1.3, 0.05]])
-    # One program for the gradients and for the values that are compared to them.
+    # One program for all derivatives and for the values that are compared to them.
     both = jax.value_and_grad(end)
+    with_second = jax.jacfwd(lambda x: (both(x), both(x)), has_aux=True)
+    points = np.array([[0.7, 0.0], [1.3, 0.05]])
     units = 1e-5 * np.concatenate([np.zeros((1, 2)), np.eye(2), -np.eye(2)])
     moved = (points[:, None] + units).reshape(10, 2)
-    values, gradients = map(np.asarray, jax.jit(jax.vmap(both))(moved))
+    found = jax.tree.map(np.asarray, jax.jit(jax.vmap(with_second))(moved))
+    (forward, second), (values, gradients) = found
     plus, minus = np.split(values.reshape(2, 5)[:, 1:], 2, axis=1)
-    exact, backward = (plus - minus) / 2e-5, gradients[::5]
+    exact = (plus - minus) / 2e-5
     assert np.all(np.abs(exact[:, 1]) > 1e-3)
-    if name == "matrix":
-        # Of second derivatives by the friction, too.
-        forward, second = jax.jit(jax.vmap(jax.jacfwd(both)))(points)
-        differences = (gradients[1::5] - gradients[3::5]) / 2e-5
-        np.testing.assert_allclose(second[..., 0], differences, rtol=1e-6, atol=1e-8)
-    else:
-        forward = jax.jit(jax.vmap(jax.jacfwd(end)))(points)
-    np.testing.assert_allclose(forward, exact, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(backward, exact, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(forward[::5], exact, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(gradients[::5], exact, rtol=1e-6, atol=1e-9)
+    # Of second derivatives by the friction, too.
+    differences = (gradients[1::5] - gradients[3::5]) / 2e-5
+    np.testing.assert_allclose(second[::5, :, 0], differences, rtol=1e-6, atol=1e-8)

@@ -47,34 +47,42 @@ TAKING = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("make", [baths, noise_beside])
-def test_a_bath_shares_its_key_with_no_other_term(make):
-    for take in TAKING.values():
-        with pytest.raises(ValueError, match="key1, key2 = jax.random.split"):
-            take(make(path(0), path(0)))
+def test_a_bath_shares_its_key_with_no_other_term():
     suggest = TAKING["suggest_solver"]
     gaussian = ds.FixedStepBrownianPath((), jr.key(0), diffrax.SpaceTimeLevyArea)
-    for other in (ds.WeakBrownianPath((), jr.PRNGKey(0)), gaussian):
-        for terms in (make(path(0), other), make(other, path(0))):
-            with pytest.raises(ValueError, match="key1, key2 = jax.random.split"):
-                suggest(terms)
-    suggest(make(path(0), path(1)))
-
-
-def moments(*several):
-    """The map of second moments by a step with each of these terms, exactly."""
-    of = lambda terms: ds.second_moment_map(terms, ds.StormerVerlet(), 0.0, 0.25, ONE)
-    return jax.jit(lambda: [of(terms) for terms in several])()
-
-
-def test_other_terms_may_share_a_path_and_a_path_its_own_key():
+    others = ds.WeakBrownianPath((), jr.PRNGKey(0)), gaussian
+    refused = [(suggest, baths(path(0), path(0)))]
+    refused += [(take, noise_beside(path(0), path(0))) for take in TAKING.values()]
+    refused += [(suggest, noise_beside(path(0), other)) for other in others]
+    refused += [(suggest, noise_beside(other, path(0))) for other in others]
+    for take, terms in refused:
+        with pytest.raises(ValueError, match="key1, key2 = jax.random.split"):
+            take(terms)
+    # A path may share its key with what is around it.
     plateaus = ds.PlateauVerlet().path((), jr.key(0))
-    TAKING["suggest_solver"](ds.langevin_terms(WELL, 1.0, 1.0, plateaus))
-    one = ds.hamiltonian_terms(WELL, SPRING, path(0))
-    twice = diffrax.MultiTerm(*one.terms, *ds.noise_terms(SPRING, path(0)).terms)
+    for terms in (
+        noise_beside(path(0), path(1)),
+        ds.langevin_terms(WELL, 1.0, 1.0, plateaus),
+    ):
+        suggest(terms)
+
+
+def test_noises_of_one_path_are_one_noise_and_those_of_two_are_two():
+    more = lambda noise, seed: ds.noise_terms(noise, path(seed)).terms
+    one = ds.hamiltonian_terms(WELL, SPRING, path(0)).terms
     double = lambda t, p, q, args: 2 * SPRING(t, p, q, args)
-    expected = ds.hamiltonian_terms(WELL, double, path(0))
-    np.testing.assert_allclose(*moments(twice, expected), rtol=1e-13, atol=1e-15)
+    kick = lambda t, p, q, args: 0.3 * q
+    both = lambda t, p, q, args: jnp.stack([SPRING(t, p, q, args), kick(t, p, q, args)])
+    equal = [
+        diffrax.MultiTerm(*one, *more(SPRING, 0)),
+        ds.hamiltonian_terms(WELL, double, path(0)),
+        diffrax.MultiTerm(*one, *more(kick, 1)),
+        ds.hamiltonian_terms(WELL, both, ds.WeakBrownianPath((2,), jr.key(0))),
+    ]
+    of = lambda terms: ds.second_moment_map(terms, ds.StormerVerlet(), 0.0, 0.25, ONE)
+    moments = jax.jit(lambda: [of(terms) for terms in equal])()
+    for pair in (moments[:2], moments[2:]):
+        np.testing.assert_allclose(*pair, rtol=1e-13, atol=1e-15)
 
 
 def doubled(first=WELL, second=WELL):
@@ -100,22 +108,6 @@ def test_noise_alone_is_that_of_the_whole_terms():
     assert type(alone) is type(noise)
     one = jnp.ones(())
     assert alone.vf_prod(0.0, ONE, None, one) == noise.vf_prod(0.0, ONE, None, one)
-    with pytest.raises(ValueError, match="`structure` must be one of"):
-        ds.noise_terms(SPRING, path(1), structure="any")  # pyright: ignore
-    with pytest.raises(ValueError, match="`noise` must be a function"):
-        ds.noise_terms(None, path(1))  # pyright: ignore
-    with pytest.raises(ValueError, match="`path` must be a Brownian path"):
-        ds.noise_terms(SPRING, None)
-
-
-def test_two_paths_are_one_of_two_noises():
-    both = lambda t, p, q, args: jnp.stack([SPRING(t, p, q, args), 0.3 * q])
-    together = ds.hamiltonian_terms(WELL, both, ds.WeakBrownianPath((2,), jr.key(0)))
-    apart = diffrax.MultiTerm(
-        *ds.hamiltonian_terms(WELL, SPRING, path(0)).terms,
-        *ds.noise_terms(lambda t, p, q, args: 0.3 * q, path(1)).terms,
-    )
-    np.testing.assert_allclose(*moments(together, apart), rtol=1e-13, atol=1e-15)
 
 
 def test_of_several_traced_paths_it_is_not_known_whether_they_are_one():

@@ -15,11 +15,12 @@ import pytest
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import lost_variance
 from diffrax_symplectic._simulation import Problem
-from diffrax_symplectic._terms import brownian_paths, step_variables
+from diffrax_symplectic._terms import brownian_paths
 
 
 ONE = jnp.array(0.0), jnp.array(1.0)
-MIDPOINT = ds.ImplicitMidpoint()
+# Sweeps solve all steps here.
+MIDPOINT = ds.ImplicitMidpoint(root_finder=ds.PicardNewton(newton_steps=0))
 WELL = lambda t, p, q, args: (p**2 + q**2) / 2
 KICK = lambda t, p, q, args: -0.5 * q
 SPRING = lambda t, p, q, args: 0.5 * q**2 / 2
@@ -57,51 +58,45 @@ def test_only_noise_that_depends_on_the_state_is_truncated():
     multiplicative = ds.hamiltonian_terms(WELL, SPRING, shape)
     assert kinds(additive) == (False,)
     assert kinds(multiplicative) == (True,)
-    for friction in (0.5, lambda t, q, args: 0.5 + q**2):
-        bath = ds.langevin_terms(WELL, friction, 1.0, shape)
-        assert kinds(bath) == (False,)
-        for noise, cut in ((KICK, False), (SPRING, True)):
-            more = ds.noise_terms(noise, shape)
-            both = diffrax.MultiTerm(*bath.terms, *more.terms)
-            assert kinds(both) == (False, cut)
-
-
-def test_paths_of_the_user_are_kept_but_not_in_a_bath():
-    cut = MIDPOINT.path((), jr.key(0))
-    assert isinstance(cut, ds.TruncatedBrownianPath)
-    given = ds.hamiltonian_terms(WELL, KICK, cut)
-    (path,) = brownian_paths(made_terms(given))
+    bath = ds.langevin_terms(WELL, lambda t, q, args: 0.5 + q**2, 1.0, shape)
+    assert kinds(bath) == (False,)
+    for noise, cut in ((KICK, False), (SPRING, True)):
+        both = diffrax.MultiTerm(*bath.terms, *ds.noise_terms(noise, shape).terms)
+        assert kinds(both) == (False, cut)
+    # A path of the user is kept, but not in a bath.
+    given = MIDPOINT.path(shape, jr.key(0))
+    assert isinstance(given, ds.TruncatedBrownianPath)
+    (path,) = brownian_paths(made_terms(ds.hamiltonian_terms(WELL, KICK, given)))
     assert isinstance(path, ds.TruncatedBrownianPath)
     for make in (ds.langevin_terms, ds.bath_terms):
-        (path,) = brownian_paths(make(WELL, 0.5, 1.0, cut))
+        (path,) = brownian_paths(make(WELL, 0.5, 1.0, given))
         assert isinstance(path, ds.FixedStepBrownianPath)
 
 
 def test_lost_variance_is_that_of_the_law():
     x = np.linspace(-12, 12, 400_001)
     density = np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi)
+    gaussian = ds.FixedStepBrownianPath((), jr.key(0))
     for k, h in itertools.product((1, 2, 4), (0.9, 0.25, 0.01)):
-        path = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((), jr.key(0)), k=k)
+        path = ds.TruncatedBrownianPath(gaussian, k=k)
         cut = np.minimum(np.abs(x), np.sqrt(2 * k * abs(np.log(h))))
         lost = 1 - np.trapezoid(cut**2 * density, x)
         assert abs(lost_variance(path, h) - lost) < 1e-9
-        wrapped = ds.TruncatedBrownianPath(path.path, k=9)
+        wrapped = ds.TruncatedBrownianPath(gaussian, k=9)
         assert lost_variance(ds.TruncatedBrownianPath(wrapped, k=k), h) >= lost - 1e-9
-        assert lost_variance(path.path, h) == 0
-
-
-def test_numbers_of_the_docstring():
-    path = ds.TruncatedBrownianPath(ds.FixedStepBrownianPath((), jr.key(0)))
+        assert lost_variance(gaussian, h) == 0
+    # The numbers of the docstring.
+    path = ds.TruncatedBrownianPath(gaussian)
     lost = [round(lost_variance(path, h), 3) for h in (1 / 20, 1 / 4, 1 / 2, 0.9, 1)]
     assert lost == [0.001, 0.033, 0.162, 0.718, 1.0]
 
 
-def exact_moments(terms, solver, h, steps):
+def moments(terms, h, steps):
     """The second moments of `(p, q)`, by a linear map."""
-    z = np.array([1.0, *map(float, ONE)])
-    moment_map = lambda h: ds.second_moment_map(terms, solver, 0.0, h, ONE)
-    K = np.asarray(jax.jit(moment_map)(h))
-    return (np.linalg.matrix_power(K, steps) @ np.kron(z, z)).reshape(3, 3)[1:, 1:]
+    of_step = lambda h: ds.second_moment_map(terms, MIDPOINT, 0.0, h, ONE)
+    start = np.array([1.0, *map(float, ONE)])
+    whole = np.linalg.matrix_power(np.asarray(jax.jit(of_step)(h)), steps)
+    return (whole @ np.kron(start, start)).reshape(3, 3)[1:, 1:]
 
 
 def assert_moments(y, exact):
@@ -114,121 +109,62 @@ def assert_moments(y, exact):
             assert abs(x.mean() - exact[i, j]) < bound + 1e-12
 
 
-def each_step(h):
-    """A step of the midpoint rule, and a slow one of another solver."""
-    cases = [(MIDPOINT, h), pytest.param(ds.SRKs1(), 0.25, marks=pytest.mark.slow)]
-    return pytest.mark.parametrize("solver, h", cases)
-
-
-@each_step(2.0)
-def test_the_law_with_additive_noise_is_exact_at_every_step(solver, h):
+def test_the_law_with_additive_noise_is_exact_at_every_step():
     # A linear system, kicked and in a bath: the law is Gaussian, with these moments.
+    h = 2.0
+    steps = 10
     bath = ds.langevin_terms(WELL, 0.5, 1.0, ())
     shaped = diffrax.MultiTerm(*bath.terms, *ds.noise_terms(KICK, ()).terms)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        paths = follow(shaped, solver, h, 10)
+        paths = follow(shaped, MIDPOINT, h, steps)
     assert paths.num_failed == 0
-    assert_moments(paths.ys, exact_moments(paths.terms(0), solver, h, 10))
+    assert_moments(paths.ys, moments(paths.terms(0), h, steps))
     # All of a Gaussian law, by its tails.
     x = paths.ys[1]
     x = (x - x.mean()) / x.std()
     assert abs((x**4).mean() - 3) < 5 * (96 / len(x)) ** 0.5
 
 
-def truncated_moments(solver, h, unit=1.0):
-    """Second moments after one step with truncated increments, by quadrature: an integral
-    between the bounds, and what lies beyond at these."""
-    path = ds.FixedStepBrownianPath((), jr.key(0))
-    terms = ds.hamiltonian_terms(WELL, SPRING, path)
-    bound = np.sqrt(4 * abs(np.log(h / unit)))
-    nodes, weights = np.polynomial.legendre.leggauss(60)
-    x = np.append(bound * nodes, [-bound, bound])
-    inner = bound * weights * np.exp(-((bound * nodes) ** 2) / 2) / np.sqrt(2 * np.pi)
-    beyond = (1 - inner.sum()) / 2
-    weights = np.append(inner, [beyond, beyond])
-
-    @jax.vmap
-    def end(value):
-        own = step_variables(terms, h).terms_with(value[None])
-        state = solver.init(own, 0.0, h, ONE, None)
-        return solver.step(own, 0.0, h, ONE, None, state, made_jump=False)[0]
-
-    y = np.stack(jax.jit(end)(x))
-    return np.einsum("k, ik, jk -> ij", weights, y, y)
-
-
-@each_step(0.5)
-def test_with_multiplicative_noise_made_paths_lose_little(solver, h):
+def test_with_multiplicative_noise_made_paths_lose_little():
     # One step over the whole interval is the longest of all.
+    h = 0.5
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        paths = follow(ds.hamiltonian_terms(WELL, SPRING, ()), solver, h, 1)
+        paths = follow(ds.hamiltonian_terms(WELL, SPRING, ()), MIDPOINT, h, 1)
     (path,) = brownian_paths(paths.terms(0))
     assert isinstance(path, ds.TruncatedBrownianPath)
     assert path.unit == 32 * h and lost_variance(path, h) < 4e-4
-    assert_moments(paths.ys, truncated_moments(solver, h, 32 * h))
+    # Those of Gaussian increments: what is lost is far below what is sampled.
+    gaussian = ds.FixedStepBrownianPath((), jr.key(0))
+    exact = moments(ds.hamiltonian_terms(WELL, SPRING, gaussian), h, 1)
+    assert_moments(paths.ys, exact)
 
 
-@each_step(0.5)
-def test_what_paths_of_the_user_lose_with_multiplicative_noise_is_said(solver, h):
-    path = solver.path((), jr.key(0), want="strong")
-    terms = ds.hamiltonian_terms(WELL, SPRING, path)
+def test_what_paths_of_the_user_lose_with_multiplicative_noise_is_said():
+    path = MIDPOINT.path((), jr.key(0), want="strong")
+    run = lambda path, h: follow(
+        ds.hamiltonian_terms(WELL, SPRING, path), ds.StormerVerlet(), h, 1, num_paths=10
+    )
     with pytest.raises(ValueError, match="as long as its `unit`.*unit=32"):
-        follow(terms, solver, 1.0, 1)
+        run(path, 1.0)
     with pytest.warns(UserWarning, match="of their variance in steps") as told:
-        paths = follow(terms, solver, h, 1)
+        run(path, 0.5)
     percent = re.findall(r"lose ([\d.]+)%", str(told[0].message))
-    assert len(told) == 1 and percent == [f"{100 * lost_variance(path, h):.1f}"]
-    assert_moments(paths.ys, truncated_moments(solver, h))
-
-
-def test_little_loss_is_not_said():
-    path = MIDPOINT.path((), jr.key(0))
-    # The second is the advice of the message.
+    assert len(told) == 1 and percent == [f"{100 * lost_variance(path, 0.5):.1f}"]
+    # Little loss is not said. The second path is the advice of the message.
     wide = ds.TruncatedBrownianPath(path.path, unit=32 * 3.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for given, h in ((path, 0.04), (wide, 3.0)):
-            terms = ds.hamiltonian_terms(WELL, SPRING, given)
-            follow(terms, ds.StormerVerlet(), h, 1, num_paths=10)
-
-
-def in_ticks(ticks):
-    """The oscillator whose unit of time holds this many ticks, in ticks."""
-    energy = lambda t, p, q, args: WELL(t, p, q, args) / ticks
-    noise = lambda t, p, q, args: SPRING(t, p, q, args) / ticks**0.5
-    return ds.hamiltonian_terms(energy, noise, ())
-
-
-@pytest.mark.slow
-def test_laws_with_multiplicative_noise_are_exact_in_every_unit_of_time():
-    ticks, h = 1e-6, 0.02
-    path = ds.FixedStepBrownianPath((), jr.key(0))
-    terms = ds.hamiltonian_terms(WELL, SPRING, path)
-    exact = exact_moments(terms, MIDPOINT, h, 50)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        paths = follow(in_ticks(ticks), MIDPOINT, h * ticks, 50)
-    assert paths.num_failed == 0
-    assert_moments(paths.ys, exact)
+            run(given, h)
 
 
 def test_all_levels_truncate_in_the_same_unit():
     problem = Problem.of(
-        lambda t, y, args: y[1], in_ticks(1.0), MIDPOINT, 1.0, 3.0, 0.5, ONE, None, None,
-        levels=3, want="strong",
+        lambda t, y, args: y[1], ds.hamiltonian_terms(WELL, SPRING, ()), MIDPOINT,
+        1.0, 3.0, 0.5, ONE, None, None, levels=3, want="strong",
     )  # fmt: skip
     (path,) = brownian_paths(problem.terms)
     assert isinstance(path, ds.TruncatedBrownianPath)
     assert path.unit == 64.0
-
-
-@pytest.mark.slow
-def test_a_bath_is_as_hot_where_phi_has_kinks():
-    terms = ds.langevin_terms(WELL, 0.5, 1.0, ())
-    estimate = ds.expectation(
-        lambda t, y, args: jnp.abs(y[1]), terms, MIDPOINT, 0, 40, 0.8, ONE,
-        key=jr.key(0), sampling=ds.IndependentPaths(20_000), levels=1,
-    )  # fmt: skip
-    assert abs(estimate.mean - np.sqrt(2 / np.pi)) < 4 * estimate.std_error
