@@ -10,6 +10,8 @@ from diffrax_symplectic._compat import stablehlo_module
 from diffrax_symplectic._stablehlo import mlir
 from diffrax_symplectic._stablehlo.operation import Operation
 
+from .replayed import recorded_lines
+
 
 # A module of MLIR owns its operations, and frees them.
 _MODULES = []
@@ -106,48 +108,33 @@ CONSTANTS = [
 ]
 
 
-@pytest.mark.parametrize("values", CONSTANTS, ids=lambda x: f"{x.dtype}{[*x.shape]}")
-def test_values_of_constants_are_read(values):
+def test_values_of_constants_are_read():
     """If this fails: print the constant, and adapt `constant_values`."""
-    constant = _operation(_lowered(lambda: jnp.asarray(values)), "stablehlo.constant")
-    found = mlir.constant_values(constant)
-    assert found.dtype == values.dtype and found.shape == values.shape
-    for part in (np.real, np.imag):
-        np.testing.assert_array_equal(part(found), part(values))
-        if values.dtype != bool:
-            signs = np.signbit(part(found)), np.signbit(part(values))
-            np.testing.assert_array_equal(*signs)
-
-
-def _lines_of_the_sine(fn):
-    """The lines that the sine in a function comes from."""
-    limit = jax.config.jax_traceback_in_locations_limit  # pyright: ignore
-    jax.config.update("jax_traceback_in_locations_limit", 10)
-    try:
-        sine = _operation(_lowered(fn, ()), "stablehlo.sine")
-    finally:
-        jax.config.update("jax_traceback_in_locations_limit", limit)
-    return mlir.source_lines(str(sine.location))
+    for values in CONSTANTS:
+        lowered = _lowered(lambda: jnp.asarray(values))
+        found = mlir.constant_values(_operation(lowered, "stablehlo.constant"))
+        assert found.dtype == values.dtype and found.shape == values.shape
+        for part in (np.real, np.imag):
+            np.testing.assert_array_equal(part(found), part(values))
+            if values.dtype != bool:
+                signs = np.signbit(part(found)), np.signbit(part(values))
+                np.testing.assert_array_equal(*signs)
 
 
 def test_the_lines_that_an_operation_comes_from_are_known():
-    """If this fails: print the location, and adapt `source_lines`."""
+    """If this fails: print the location, and adapt `source_lines`, or for the line of a
+    generator, which is one of its function, `_named`."""
 
-    def one(x):
+    def plain(x):
         return jnp.sin(x)
 
-    lines = _lines_of_the_sine(one)
-    (own,) = [line for line in lines if line.function == "one"]
-    assert own.file == __file__
-    assert own.line == one.__code__.co_firstlineno + 1
-
-
-def test_a_line_of_a_generator_is_one_of_its_function():
-    """If this fails: print the location, and adapt `_named`."""
-
-    def one(x):
+    def of_a_generator(x):
         return sum(jnp.sin(i * x) for i in range(1, 2))
 
-    own = [line for line in _lines_of_the_sine(one) if line.file == __file__]
-    assert own[0].function == "one"
-    assert own[0].line == one.__code__.co_firstlineno + 1
+    for fn in (plain, of_a_generator):
+        with recorded_lines():
+            sine = _operation(_lowered(fn, ()), "stablehlo.sine")
+        lines = mlir.source_lines(str(sine.location))
+        own, *_ = [line for line in lines if line.file == __file__]
+        assert own.function == fn.__name__
+        assert own.line == fn.__code__.co_firstlineno + 1
