@@ -14,18 +14,11 @@ from jax import lax
 
 
 PARTS = []
-# Sines of angles that are too large for kernels: JAX gets such paths.
-HANDED_BACK = []
 
 
 def part(fn):
     PARTS.append(fn)
     return fn
-
-
-def handed_back(fn):
-    HANDED_BACK.append(fn)
-    return part(fn)
 
 
 def quarters(x):
@@ -115,30 +108,11 @@ def window_of_a_table(x):
     return jnp.sum(lax.dynamic_slice(values, (place,), (3,))) * x * x
 
 
-@part
-def largest_of_several(x):
-    y = jnp.stack([x, x * x, jnp.sin(2 * x)])
-    return jnp.max(y) / 2 + jnp.min(y) / 2 + jnp.argmax(y) * x / 2
-
-
 # Complex constants
 
 
 def constant(value, x):
     return lambda: jnp.asarray(value, jnp.result_type(x, jnp.complex64))
-
-
-@part
-def complex_constants_of_branches(x):
-    same = constant(2 + 1j, x)
-    return x * jnp.imag(lax.cond(x > 0.3, same, same) * (1 + 0.5j)) / 3
-
-
-@part
-def complex_numbers_with_one_constant_part(x):
-    half = lambda: lax.complex(x, jnp.full_like(x, 0.5))
-    real = lambda: lax.complex(x * x, jnp.full_like(x, 0.5))
-    return jnp.imag(lax.cond(x > 0.1, half, real) ** 2)
 
 
 @part
@@ -161,9 +135,9 @@ def complex_loop(x):
 # Large angles
 
 
-@handed_back
+@part
 def sine_of_a_large_angle_in_a_loop(x):
-    # The last angle is 1.2e10, for large numbers only.
+    # The last angle is 1.2e10, for large numbers only: too large for kernels.
     angle = lambda i: jnp.where(x > 0.8, 1e9 * i.astype(x.dtype), 1.0)
     return x * lax.fori_loop(0, 13, lambda i, y: y / 2 + jnp.sin(angle(i)), x)
 
@@ -178,14 +152,6 @@ def table_in_a_branch(x):
     table = jnp.asarray(TABLE, x.dtype)
     read = lambda table: x * table[50 + quarters(x)]
     return lax.cond(x > 0, read, lambda table: x * table[3], table)
-
-
-@part
-def shifts_of_integers(x):
-    signed = lax.shift_right_logical(quarters(x), jnp.int32(28)) / 16
-    n = quarters(x).astype(jnp.uint32)
-    other = lax.shift_right_arithmetic(n, jnp.uint32(3)) & 3
-    return x * (signed + other.astype(x.dtype)) / 4
 
 
 # Linear systems and sorting
@@ -278,7 +244,7 @@ class Drawn(NamedTuple):
     @property
     def handed_back(self) -> bool:
         """Whether JAX gets many of the paths."""
-        return any(part in HANDED_BACK for part in self.parts)
+        return sine_of_a_large_angle_in_a_loop in self.parts
 
 
 def drawn(rng: np.random.Generator, first: Callable, depth: int) -> Drawn:
