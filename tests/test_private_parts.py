@@ -127,7 +127,7 @@ def test_adjoints_of_diffrax_run_a_loop_with_the_arguments_and_the_state_known_h
     with jax.ensure_compile_time_eval(), jax.disable_jit():
         sol = diffrax.diffeqsolve(
             term, diffrax.Euler(), 0.1, 0.43, 0.1, jnp.array(1.0), saveat=saveat,
-            adjoint=Spy(), max_steps=16,
+            adjoint=Spy(), max_steps=4,
         )  # fmt: skip
         # The state of a constant step size: how many steps are made, and in which times.
         assert steps[0].num_steps() == 4 == sol.stats["num_steps"]
