@@ -98,7 +98,6 @@ OF_TERMS = {
     ],
     "one Hamiltonian for each noise of the path": _pairs(
         lambda t, p, q, args: q,
-        lambda t, p, q, args: jnp.outer(q, q),
         lambda t, p, q, args: jnp.sum(q),
         lambda t, p, q, args: (jnp.sum(q),) * 2,
         m=2,
@@ -132,12 +131,7 @@ OF_TERMS = {
     ],
     r"`noise` is called as .*another order, `\(t, [qx]": [
         lambda swapped=swapped: ds.hamiltonian_terms(_total, swapped, PATH)
-        for swapped in (
-            lambda t, q, p, args: q,
-            lambda t, x, v, args: x,
-            lambda t, x, p, args: x,
-            lambda t, q, v, args: q,
-        )
+        for swapped in (lambda t, q, p, args: q, lambda t, x, v, args: x)
     ],
     "Both are real; got.*`wave_terms`": [
         _from(y0, solver)
@@ -171,7 +165,8 @@ def test_other_names_and_integers_will_do():
     for other in (lambda t, mom, pos, args: pos, lambda *args: args[2]):
         ds.hamiltonian_terms(_total, other, PATH)
     # Diffrax itself turns an integer state into a floating-point one.
-    assert jnp.issubdtype(_solve(DECAY, jnp.ones(2, int)).ys.dtype, jnp.floating)
+    end = jax.eval_shape(lambda y: _solve(DECAY, y).ys, jnp.ones(2, int))
+    assert jnp.issubdtype(end.dtype, jnp.floating)
 
 
 @pytest.mark.parametrize("solver", [diffrax.Euler(), diffrax.ItoMilstein()])
@@ -199,97 +194,76 @@ def test_ito_solvers_are_refused_where_the_sense_makes_a_difference(solver):
     solve(noise=kick)
 
 
-@pytest.mark.parametrize("solver, m", [(ds.ImplicitMidpoint(), 3), (diffrax.Heun(), 1)])
+@pytest.mark.parametrize("solver, m", [(ds.StormerVerlet(), 3), (diffrax.Heun(), 1)])
 def test_noise_that_does_not_depend_on_the_state_is_refused(solver, m):
-    H = lambda t, p, q, args: jnp.sum(p**2 + q**2)
     y0 = (jnp.ones(2), jnp.ones(2))
+    zero_gradient = r"does not depend on the state.*-sigma \* q"
+
+    def solve(noise, args, solver=solver):
+        terms = ds.hamiltonian_terms(_total, noise, weak_path(m, two_point=True))
+        diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0, args)
+
     # An amplitude in place of a Hamiltonian, of which the gradient is zero.
     for amplitude in (
-        lambda t, p, q, args: 0.05 * jnp.ones(m),
         lambda t, p, q, args: args * jnp.cos(t) * jnp.ones(m),
         ds.IndexedNoise(lambda k, t, p, q, args: 0.05, m),
     ):
-        terms = ds.hamiltonian_terms(H, amplitude, weak_path(m, two_point=True))
-        with pytest.raises(
-            ValueError, match=r"does not depend on the state.*-sigma \* q"
-        ):
-            diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0, jnp.array(0.05))
-        with pytest.raises(ValueError, match="does not depend on the state"):
+        for each in (solver, ds.NinomiyaVictoir()):
+            with pytest.raises(ValueError, match=zero_gradient):
+                solve(amplitude, jnp.array(0.05), each)
+        terms = ds.hamiltonian_terms(_total, amplitude, weak_path(m))
+        with pytest.raises(ValueError, match=zero_gradient):
             ds.suggest_solver(terms, 0.0, y0, jnp.array(0.05), want="weak")
-    with pytest.raises(ValueError, match="does not depend on the state"):
-        diffrax.diffeqsolve(terms, ds.NinomiyaVictoir(), 0.0, 0.2, 0.1, y0)
     # What is zero for these values alone is not refused.
     kick = lambda t, p, q, args: -args * q[:1] * jnp.ones(m)
-    terms = ds.hamiltonian_terms(H, kick, weak_path(m))
     for zero in (0.0, jnp.array(0.0)):
-        solve = lambda: diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0, zero).ys
-        jax.eval_shape(solve)
+        jax.eval_shape(lambda: solve(kick, zero))
 
 
-def _branches(t, p, q, args):
-    return jnp.sum(p**2) if p[0] > 0 else jnp.sum(q**2)
+ASKING = {
+    "branches": lambda t, p, q, args: jnp.sum(p**2) if p[0] > 0 else jnp.sum(q**2),
+    "selects": lambda t, p, q, args: jnp.sum(q[p > 0]),
+    "takes numpy": lambda t, p, q, args: np.sum(np.sin(q)),
+    "takes float": lambda t, p, q, args: float(q[0]),
+    "counts": lambda t, p, q, args: jnp.sum(jnp.ones(int(q[0])) * q),
+}
 
 
-def _selects(t, p, q, args):
-    return jnp.sum(q[p > 0])
-
-
-def _takes_numpy(t, p, q, args):
-    return np.sum(np.sin(q))
-
-
-def _takes_float(t, p, q, args):
-    return float(q[0])
-
-
-def _counts(t, p, q, args):
-    return jnp.sum(jnp.ones(int(q[0])) * q)
-
-
-@pytest.mark.parametrize("name", ["H0", "noise"])
-@pytest.mark.parametrize(
-    "asks", [_branches, _selects, _takes_numpy, _takes_float, _counts]
-)
-def test_a_hamiltonian_that_asks_for_values_is_named(name, asks):
-    square = lambda t, p, q, args: jnp.sum(p**2)
-    H0, noise = (asks, square) if name == "H0" else (square, asks)
-    terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
-    with pytest.raises(ValueError, match=f"`{name}` needs concrete.*jnp.where"):
-        _solve(terms, (jnp.ones(2), jnp.ones(2)))
+@pytest.mark.parametrize("asks", ASKING.values(), ids=ASKING)
+def test_a_hamiltonian_that_asks_for_values_is_named(asks):
+    for name, functions in (("H0", (asks, _total)), ("noise", (_total, asks))):
+        terms = ds.hamiltonian_terms(*functions, weak_path(1))
+        with pytest.raises(ValueError, match=f"`{name}` needs concrete.*jnp.where"):
+            _solve(terms, (jnp.ones(2), jnp.ones(2)))
 
 
 def test_a_forgotten_args_is_asked_about():
     H = lambda t, p, q, args: jnp.sum(p**2) + args["k"] * jnp.sum(q**2)
-    plain = lambda t, p, q, args: jnp.sum(q**2)
     one = ds.IndexedNoise(lambda k, t, p, q, args: args["k"] * q[k], 1)
     y0 = (jnp.ones(2), jnp.ones(2))
 
-    def asked(name, kind, call):
-        with pytest.raises(kind) as info:
-            call()
-        asked = [note for note in info.value.__notes__ if "left out" in note]
-        assert asked == [f"`{name}` was called with `args=None`. Was it left out?"]
-        assert "'NoneType' obj" in str(info.value)
+    def calls(phi, *functions):
+        terms = ds.hamiltonian_terms(*functions, weak_path(1))
+        yield lambda: ds.expectation(
+            phi, terms, ds.ImplicitMidpoint(), 0, 1, 0.1, y0, key=jr.key(0)
+        )
+        if phi is first:
+            yield lambda: _solve(terms, y0)
+            yield lambda: ds.suggest_solver(terms, 0, y0, want="strong")
 
-    phi = lambda t, y, args: y[0]
-    mean = lambda phi, terms: ds.expectation(
-        phi, terms, ds.ImplicitMidpoint(), 0, 1, 0.1, y0, key=jr.key(0)
-    )
-    for name, hamiltonians in (
-        ("H0", (H, plain)),
-        ("noise", (plain, H)),
-        ("H", (plain, one)),
+    first = lambda t, y, args: y[0]
+    for name, kind, *functions in (
+        ("H0", TypeError, first, H, _total),
+        ("noise", TypeError, first, _total, H),
+        ("H", TypeError, first, _total, one),
+        ("phi", AttributeError, lambda t, y, args: args.k, _total, _total),
     ):
-        terms = ds.hamiltonian_terms(*hamiltonians, weak_path(1))
-        asked(name, TypeError, lambda: _solve(terms, y0))
-        asked(name, TypeError, lambda: ds.suggest_solver(terms, 0, y0, want="strong"))
-        asked(name, TypeError, lambda: mean(phi, terms))
-    terms = ds.hamiltonian_terms(plain, plain, weak_path(1))
-    asked("phi", AttributeError, lambda: mean(lambda t, y, args: args.k, terms))
-
-
-def _position(t, y, args):
-    return y[1]
+        for call in calls(*functions):
+            with pytest.raises(kind) as info:
+                call()
+            notes = [note for note in info.value.__notes__ if "left out" in note]
+            assert notes == [f"`{name}` was called with `args=None`. Was it left out?"]
+            assert "'NoneType' obj" in str(info.value)
 
 
 def _force(t, p, q, args):
@@ -303,7 +277,7 @@ GIVEN = dict(t0=0, t1=1, y0=(0.0, 1.0), key=jr.key(0))
 OF_ONE = GIVEN | dict(terms=TERMS, solver=ds.StormerVerlet(), dt0=0.5)
 
 
-def _mean(phi=_position, **others):
+def _mean(phi=lambda t, y, args: y[1], **others):
     few = dict(sampling=ds.IndependentPaths(16))
     return ds.expectation(phi, **(OF_ONE | few | others))
 
@@ -338,10 +312,8 @@ HUGE = 10**12
 REFUSED = {
     "`confidence` must be a number between 0 and 1, such as 0.95": [
         lambda: _drawn().interval(95),
-        lambda: _drawn().interval(0),
         lambda: _drawn().interval(float("nan")),
         lambda: _drawn().interval("0.95"),  # pyright: ignore
-        lambda: _drawn().interval(None),  # pyright: ignore
         lambda: _drawn().interval(np.array([0.5, 0.9])),  # pyright: ignore
     ],
     "`tol` must be a positive number": [
@@ -367,7 +339,6 @@ REFUSED = {
     ],
     "`expectation` needs a random key": [lambda: _mean(key=3)],
     "`compare_solvers` needs a random key": [
-        lambda: _compared(key=0),
         lambda: _compared(key=None),
     ],
     "`first` must be an integer from 0 to": [
@@ -381,7 +352,6 @@ REFUSED = {
     "`levels` must be an integer from 1 to": [
         lambda: _mean(levels=2000),
         lambda: _mean(levels=0),
-        lambda: _drawn(levels=2000, order=1),
     ],
     "paths take .* GB or more, of .* GB. Pass a smaller `batch_size`": [
         lambda: _mean(sampling=ds.IndependentPaths(64, HUGE)),
@@ -396,11 +366,9 @@ REFUSED = {
     ],
     "`num_paths` must be an integer, 2 or larger": [
         lambda: _compared(num_paths=0),
-        lambda: _compared(num_paths=1.5),
         lambda: _compared(num_paths="many"),
     ],
     "must return arrays with one entry or more": [
-        lambda: _mean(lambda t, y, args: jnp.zeros(0)),
         lambda: _mean(lambda t, y, args: {"one": y[1], "none": jnp.zeros((2, 0))}),
         lambda: _drawn(lambda key: jr.normal(key, (0,))),
     ],
@@ -420,7 +388,6 @@ REFUSED = {
     "`solvers` must be a list of one or more solvers": [
         lambda: _compared(solvers=[]),
         lambda: _compared(solvers=ds.StormerVerlet()),
-        lambda: _compared(solvers="StormerVerlet"),
     ],
     "`y0` must hold numbers and arrays of numbers.*got a": [
         call
