@@ -134,17 +134,6 @@ def test_pages_of_evidence_have_the_text_of_the_programs_that_write_them():
             assert f'write("{module}"' in source.read_text()
 
 
-def test_docs_list_every_solver():
-    page = (ROOT / "docs/solvers/index.md").read_text()
-    folder = ROOT / "docs/solvers"
-    families = "".join(p.read_text() for p in folder.glob("[!i]*.md"))
-    for name, value in vars(ds).items():
-        if isinstance(value, type) and issubclass(value, diffrax.AbstractSolver):
-            if not name.startswith("Abstract"):
-                assert f"| [`{name}`](" in page, name
-                assert f"::: diffrax_symplectic.{name}\n" in families
-
-
 def test_every_class_of_solvers_is_public_and_in_the_tables():
     known = {*SOLVERS, *LANGEVIN, ds.Splitting, ds.LinearFlow}
     for info in pkgutil.iter_modules(_solver.__path__):

@@ -1,15 +1,11 @@
 """Where methods fail and where they hold: the claims of `docs/stability.md`."""
 
-import diffrax
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
 from examples.stability import _models, rounding, solvability, stiff
-
-from ..problems import Given
 
 
 pytestmark = pytest.mark.slow
@@ -75,27 +71,6 @@ def _check_against_the_exact_share(r):
             for law, exact in ((0, gaussian), (-1, three)):
                 error = np.sqrt(exact * (1 - exact) / SOLVE_STEPS)
                 assert abs(r.unsolvable[law, i, j] - exact) <= 4 * error + 1e-3 * exact
-
-
-def test_a_singular_linear_step_is_reported():
-    # q' = q, p' = -p by the noise alone: q1 = q0 (1 + I / 2) / (1 - I / 2), and p1 the
-    # other way round. No solution iff I = 2.
-    def step(W):
-        terms = ds.hamiltonian_terms(
-            lambda t, p, q, args: 0 * p, lambda t, p, q, args: p * q, Given(W)
-        )
-        y0 = (jnp.array(1.0), jnp.array(1.0))
-        y1, *_, result = ds.ImplicitMidpoint().step(
-            terms, 0.0, 0.1, y0, None, None, False
-        )
-        return y1, result == diffrax.RESULTS.successful
-
-    W = np.array([-1.0, 1.0, 1.9, 2.0, 2.1])
-    (p, q), good = jax.vmap(step)(W)
-    np.testing.assert_array_equal(good, [True, True, True, False, True])
-    exact = ((1 + W / 2) / np.where(W == 2, np.nan, 1 - W / 2))[good]
-    np.testing.assert_allclose(q[good], exact, rtol=1e-12)
-    np.testing.assert_allclose(p[good], 1 / exact, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
