@@ -5,7 +5,6 @@ The derivatives of these functions are of the size of one, and what they compare
 to integers is not within rounding of another answer, for most numbers."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,9 +23,6 @@ def part(fn):
 def quarters(x):
     """A whole number, as an integer."""
     return jnp.floor(4 * lax.stop_gradient(x)).astype(jnp.int32)
-
-
-# Control flow, with values from outside, constants and results that nothing needs
 
 
 def square(x):
@@ -102,37 +98,10 @@ def loop_of_unknown_length(x):
 
 
 @part
-def window_of_a_table(x):
-    values = jnp.linspace(-1, 1, 7, dtype=x.dtype)
-    place = jnp.clip(jnp.floor(2 * x).astype(jnp.int32), 0, 4)
-    return jnp.sum(lax.dynamic_slice(values, (place,), (3,))) * x * x
-
-
-# Complex constants
-
-
-def constant(value, x):
-    return lambda: jnp.asarray(value, jnp.result_type(x, jnp.complex64))
-
-
-@part
-def complex_constants_of_loops(x):
-    def once(i, state):
-        y, _ = state
-        return y / 2 + x, constant(1 + 0.5j, x)()
-
-    y, value = lax.fori_loop(0, 12, once, (x, constant(1j, x)()))
-    return jnp.real(value * y) / 3 + x * jnp.imag(value)
-
-
-@part
 def complex_loop(x):
     turned = lambda i, z: z * (0.8 + 0.5j) + x / 9
     z = lax.fori_loop(0, 11, turned, lax.complex(x, 1 - x))
     return jnp.real(z * jnp.conj(z)) / 4 + jnp.imag(jnp.exp(1j * z))
-
-
-# Large angles
 
 
 @part
@@ -141,8 +110,6 @@ def sine_of_a_large_angle_in_a_loop(x):
     angle = lambda i: jnp.where(x > 0.8, 1e9 * i.astype(x.dtype), 1.0)
     return x * lax.fori_loop(0, 13, lambda i, y: y / 2 + jnp.sin(angle(i)), x)
 
-
-# Tables
 
 TABLE = np.sin(np.arange(200.0))
 
@@ -154,19 +121,11 @@ def table_in_a_branch(x):
     return lax.cond(x > 0, read, lambda table: x * table[3], table)
 
 
-# Linear systems and sorting
-
-
 @part
 def linear_system(x):
     matrix = jnp.array([[2.0, 0.5], [0.0, 3.0]], x.dtype)
     shifted = matrix + x * jnp.eye(2, dtype=x.dtype) / 2
     return x * jnp.linalg.solve(shifted, jnp.stack([x, jnp.ones_like(x)]))[0]
-
-
-@part
-def median(x):
-    return jnp.median(jnp.stack([x, x * x, jnp.sin(3 * x)]))
 
 
 # What the parts stand in
@@ -235,20 +194,11 @@ COMPANY = (
 )
 
 
-class Drawn(NamedTuple):
-    """A random function `fn`, and the parts in it."""
-
-    fn: Callable
-    parts: list[Callable]
-
-    @property
-    def handed_back(self) -> bool:
-        """Whether JAX gets many of the paths."""
-        return sine_of_a_large_angle_in_a_loop in self.parts
-
-
-def drawn(rng: np.random.Generator, first: Callable, depth: int) -> Drawn:
-    """A function of this depth with the part `first`, and others at random, in it."""
+def drawn(
+    rng: np.random.Generator, first: Callable, depth: int
+) -> tuple[Callable, list[Callable]]:
+    """A random function of this depth with the part `first`, and others at random, in it;
+    and these parts."""
     parts: list[Callable] = []
 
     def at(depth: int) -> Callable:
@@ -258,4 +208,4 @@ def drawn(rng: np.random.Generator, first: Callable, depth: int) -> Drawn:
         parts.append(PARTS[rng.integers(len(PARTS))] if parts else first)
         return parts[-1]
 
-    return Drawn(at(depth), parts)
+    return at(depth), parts
