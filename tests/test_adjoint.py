@@ -171,6 +171,10 @@ CASES = {
         *(ds.ImplicitMidpoint(), phase, dict(t0=0.0, t1=1.03, dt0=0.1)),
         *(SAVED, jnp.float64),
     ),
+    "with friction": (
+        *(ds.BAOAB(ds.StormerVerlet()), kicks, dict(t0=0.0, t1=1.03, dt0=0.1)),
+        *(SAVED, jnp.float64),
+    ),
     "in single precision": (
         *(ds.StormerVerlet(), kicks, dict(zip(["t0", "t1", "dt0"], STEPS_IN_SINGLE))),
         *(SAVED.astype(jnp.float32), jnp.float32),
@@ -183,6 +187,7 @@ CASES = {
     [
         "backward by given steps",
         pytest.param("implicit", marks=pytest.mark.slow),
+        pytest.param("with friction", marks=pytest.mark.slow),
         pytest.param("in single precision", marks=[pytest.mark.slow, pytest.mark.core]),
     ],
 )
@@ -196,6 +201,10 @@ def test_gradients_are_those_of_forward_mode(name):
     def loss(x, adjoint):
         stiffness, args, y0 = x
         terms = ds.hamiltonian_terms(Spring(stiffness), noise, path)
+        if isinstance(solver, LANGEVIN):
+            # Of the rates, too.
+            rates = as_friction(jnp.diag(stiffness))
+            terms = damped_terms(Spring(stiffness), rates, noise, path)
         p, q = diffrax.diffeqsolve(
             terms, solver, **times, y0=y0, args=args, adjoint=adjoint,
             saveat=diffrax.SaveAt(ts=saved),
@@ -345,36 +354,3 @@ def test_what_reversing_cannot_do_is_refused_with_advice():
     backsolve = lambda y0: solve(y0, adjoint=diffrax.BacksolveAdjoint())
     with pytest.raises(ValueError, match="BacksolveAdjoint.*ReversingAdjoint"):
         jax.eval_shape(jax.grad(backsolve), 1.0)
-
-
-@pytest.mark.slow
-def test_friction_beside_a_flow_is_walked_back_too():
-    form = jnp.array([[1.0, 0.4], [0.4, 0.7]])
-    H0 = lambda t, p, q, args: jnp.sum(p**2) / 2 - args * jnp.sum(jnp.cos(q + t))
-    noise = lambda t, p, q, args: args * jnp.sum(jnp.sin(q))
-    path = ds.WeakBrownianPath((), jr.key(0))
-    make = lambda friction: damped_terms(H0, friction, noise, path)
-    solver, y0 = (
-        ds.BAOAB(ds.StormerVerlet()),
-        (jnp.array([0.3, 0.1]), jnp.array([0.5, -0.2])),
-    )
-
-    @jax.jit
-    def gradients(gamma):
-        def loss(y0, args, gamma, adjoint):
-            terms = make(as_friction(gamma * form))
-            sol = diffrax.diffeqsolve(
-                terms, solver, 0.0, 2.0, 0.1, y0, args, adjoint=adjoint
-            )
-            return jnp.sum(sol.ys[0][-1] * sol.ys[1][-1])
-
-        adjoints = ds.ReversingAdjoint(4), diffrax.RecursiveCheckpointAdjoint()
-        by = jax.grad(loss, (0, 1, 2))
-        return [by(y0, 0.7, gamma, adjoint) for adjoint in adjoints]
-
-    # Of the state, of a parameter of the terms, and of the friction itself.
-    for gamma in (0.0, 0.4, 2.0):
-        ours, theirs = gradients(gamma)
-        for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs)):
-            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-12)
-        assert ours[2] != 0

@@ -1,11 +1,6 @@
 """What the package uses of other packages that they do not promise to keep. If one of these
 tests fails after an upgrade, its name says what broke; other failures follow from it."""
 
-import inspect
-import subprocess
-import sys
-import textwrap
-
 import diffrax
 import equinox as eqx
 import jax
@@ -64,75 +59,12 @@ def test_the_resolution_of_a_tree_is_the_tolerance_that_it_was_given():
     assert jnp.allclose(_compat.resolution(tree), 1e-3)
 
 
-def test_the_terms_that_backsolve_adjoint_solves_are_known():
-    """If this fails: find the term of `BacksolveAdjoint`, and adapt `is_adjoint_term`."""
-    seen = []
-
-    class Spy(diffrax.Euler):
-        def init(self, terms, t0, t1, y0, args):
-            seen.append(_compat.is_adjoint_term(terms))
-
-    def loss(y0):
-        drift = diffrax.ODETerm(lambda t, y, args: -y)
-        adjoint = diffrax.BacksolveAdjoint()
-        sol = diffrax.diffeqsolve(drift, Spy(), 0.0, 1.0, 0.5, y0, adjoint=adjoint)
-        return sol.ys[-1]
-
-    jax.eval_shape(jax.grad(loss), jnp.array(0.3))
-    assert set(seen) == {False, True}
-
-
-def test_omega_does_arithmetic_on_pytrees():
-    """If this fails: take omega from where it moved to, or copy its hundred lines."""
-    x = {"a": jnp.array([1.0, 2.0]), "b": (jnp.array(3.0),)}
-    y = (2 * x**_compat.ω - x**_compat.ω / 2).ω
-    assert jnp.array_equal(y["a"], jnp.array([1.5, 3.0])) and y["b"][0] == 4.5
-
-
 def test_equinox_refuses_derivatives_of_what_is_nondifferentiable():
     """If this fails: write it by `jax.custom_jvp`, with a rule that raises."""
     f = lambda x: _compat.nondifferentiable(x, name="t")
     assert f(2.0) == 2.0
     with pytest.raises(RuntimeError, match="t"):
         jax.jvp(f, (2.0,), (1.0,))
-
-
-@pytest.mark.core
-def test_adjoints_of_diffrax_run_a_loop_with_the_arguments_and_the_state_known_here():
-    """If this fails: read `diffrax/_integrate.py` for the new state of the loop, and adapt
-    `SolveState`, `StepTimes` and `run_steps`. Nothing but `ReversingAdjoint` needs them."""
-    # `ReversingAdjoint` calls the loop of a solve, and reads these parts of its state.
-    steps = []
-
-    class Spy(diffrax.RecursiveCheckpointAdjoint):
-        def loop(self, *, init_state, terms, passed_solver_state, **kwargs):
-            own = set(inspect.signature(ds.ReversingAdjoint.loop).parameters)
-            given = {"init_state", "terms", "passed_solver_state", *kwargs}
-            assert own - {"self", "kwargs"} <= given
-            assert callable(self._loop)
-            for part in ("y", "tprev", "tnext", "num_steps", "solver_state"):
-                assert hasattr(init_state, part)
-            for part in ("ys", "saveat_ts_index"):
-                assert hasattr(init_state.save_state, part)
-            steps.append(_compat.StepTimes(kwargs["stepsize_controller"], init_state))
-            return super().loop(
-                init_state=init_state,
-                terms=terms,
-                passed_solver_state=passed_solver_state,
-                **kwargs,
-            )
-
-    term = diffrax.ODETerm(lambda t, y, args: -y)
-    saveat = diffrax.SaveAt(t0=True, steps=True)
-    with jax.ensure_compile_time_eval(), jax.disable_jit():
-        sol = diffrax.diffeqsolve(
-            term, diffrax.Euler(), 0.1, 0.43, 0.1, jnp.array(1.0), saveat=saveat,
-            adjoint=Spy(), max_steps=4,
-        )  # fmt: skip
-        # The state of a constant step size: how many steps are made, and in which times.
-        assert steps[0].num_steps() == 4 == sol.stats["num_steps"]
-        times = [steps[0].time(i) for i in range(5)]
-    assert sol.ts[:5].tolist() == times and 0.2 in times and times[2] < 0.3
 
 
 def test_values_are_told_from_traced_ones():
@@ -204,69 +136,6 @@ def test_drjit_knows_the_values_of_constants_and_of_what_follows_from_them():
     pair = array_types()["complex<f64>"]
     assert _compat.is_literal(pair(1, 2))
     assert not _compat.is_literal(pair(1, number([1, 2])))
-
-
-on_cpu = pytest.mark.skipif(jax.default_backend() != "cpu", reason="needs LLVM")
-
-
-def needs_llvm(test):
-    return needs_drjit(on_cpu(test))
-
-
-def _ends_with(code: str) -> subprocess.CompletedProcess:
-    """A program of Dr.Jit, which may abort, in a process of its own."""
-    start = "import drjit as dr\nfrom drjit.llvm import Float\nx = Float([1, -2, 3])\n"
-    command = [sys.executable, "-c", start + textwrap.dedent(code)]
-    return subprocess.run(command, capture_output=True, text=True)
-
-
-# Two faults of Dr.Jit 1.5. Once one of these tests fails, Dr.Jit has mended it. The
-# function that is named can go as soon as `pyproject.toml` asks for that version.
-
-
-@pytest.mark.slow
-@needs_llvm
-def test_drjit_writes_the_result_of_a_conditional_into_what_its_branch_returned():
-    # So `_stablehlo.tensor.copied_entries` copies what a branch returns.
-    done = _ends_with(
-        """
-        y = 3 * x
-        dr.if_stmt((), x > 0, lambda: x * x, lambda: y, mode="symbolic")
-        print(y)
-        """
-    )
-    assert done.stdout.split("\n")[0] == "[1, -6, 9]", done.stderr
-
-
-@pytest.mark.slow
-@needs_llvm
-def test_drjit_returns_the_constant_of_a_branch_from_a_conditional():
-    # So `_stablehlo.tensor.as_own_literal` makes constants anew.
-    done = _ends_with(
-        """
-        half = lambda sign: lambda: (Float(0.5), sign * x)
-        y, z = dr.if_stmt((), x > 0, half(1), half(-1), mode="symbolic")
-        print(z + dr.if_stmt((), x > 0, lambda: y, lambda: x, mode="symbolic"))
-        """
-    )
-    assert done.returncode < 0 and "does not dominate all uses" in done.stderr
-
-
-def test_operations_of_a_jaxpr_are_evaluated_one_by_one():
-    """If this fails: look up how `jax.core.eval_jaxpr` binds an operation, and adapt
-    `results_of_operation`."""
-
-    @jax.custom_jvp
-    def sine(x):
-        return jnp.sin(x)
-
-    sine.defjvp(lambda primals, tangents: (sine(*primals), tangents[0]))
-    program = jax.make_jaxpr(lambda x: jax.lax.sort((sine(x), x)))(jnp.arange(3.0))
-    call, sort = program.jaxpr.eqns
-    (y,) = _compat.results_of_operation(call, [jnp.arange(3.0)], call.params)
-    assert jnp.allclose(y, jnp.sin(jnp.arange(3.0)))
-    keys, values = _compat.results_of_operation(sort, [-y, y], sort.params)
-    assert jnp.array_equal(keys, jnp.sort(-y)) and jnp.array_equal(values, -keys)
 
 
 def test_the_versions_with_calls_of_lapack_that_block_each_other(monkeypatch):
