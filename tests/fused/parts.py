@@ -111,7 +111,8 @@ def sine_of_a_large_angle_in_a_loop(x):
     return x * lax.fori_loop(0, 13, lambda i, y: y / 2 + jnp.sin(angle(i)), x)
 
 
-TABLE = np.sin(np.arange(200.0))
+# Of more entries a kernel would only read an array in `args`.
+TABLE = np.sin(np.arange(60.0))
 
 
 @part
