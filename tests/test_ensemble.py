@@ -172,10 +172,6 @@ def table(t, p, q, args):
     return jnp.sum(p**2) / 2 + jnp.cos(q[0] * args)[place]
 
 
-def solved(t, p, q, args):
-    return jnp.sum(p**2) / 2 + jnp.linalg.eigvalsh(jnp.eye(3) + jnp.outer(q, q))[0]
-
-
 def several(t, p, q, args):
     return jnp.sum(p**2) / 2 + sum(jnp.abs(jnp.fft.fft(i * q))[0] for i in range(2))
 
@@ -195,7 +191,6 @@ REFUSED = [
     (short, "numbers of type `f16`"),
     (ordered, "`stablehlo.sort` of more than 16 numbers"),
     (table, "`stablehlo.dynamic_slice` with an index per path, among 100 places"),
-    (solved, "a call of `lapack_dsyevd"),
 ]
 
 

@@ -43,6 +43,16 @@ def replayed(program: Callable | str, *args: np.ndarray) -> list[np.ndarray]:
     return results
 
 
+def replayed_and_by_jax(functions: dict[str, Callable], *args: np.ndarray):
+    """The name of each of these functions, what is replayed, and what JAX gives: all in one
+    program, since most of the time is compiling."""
+    every = lambda *args: [fn(*args) for fn in functions.values()]
+    exact = map(np.asarray, jax.jit(jax.vmap(every))(*args))
+    for name, x, y in zip(functions, replayed(every, *args), exact, strict=True):
+        assert x.dtype == y.dtype and x.shape == y.shape, name
+        yield name, x, y
+
+
 def replayed_lanes(
     program: Callable | str, *args: np.ndarray
 ) -> tuple[list[np.ndarray], np.ndarray]:

@@ -8,8 +8,6 @@ import numpy as np
 from diffrax_symplectic._compat import stablehlo_module
 from diffrax_symplectic._stablehlo import mlir
 
-from .replayed import recorded_lines
-
 
 # A module of MLIR owns its operations, and frees them.
 _MODULES = []
@@ -67,22 +65,3 @@ def test_values_of_constants_are_read():
             if values.dtype != bool:
                 signs = np.signbit(part(found)), np.signbit(part(values))
                 np.testing.assert_array_equal(*signs)
-
-
-def test_the_lines_that_an_operation_comes_from_are_known():
-    """If this fails: print the location, and adapt `source_lines`, or for the line of a
-    generator, which is one of its function, `_named`."""
-
-    def plain(x):
-        return jnp.sin(x)
-
-    def of_a_generator(x):
-        return sum(jnp.sin(i * x) for i in range(1, 2))
-
-    for fn in (plain, of_a_generator):
-        with recorded_lines():
-            sine = _operation(_lowered(fn, ()), "stablehlo.sine")
-        lines = mlir.source_lines(str(sine.location))
-        own, *_ = [line for line in lines if line.file == __file__]
-        assert own.function == fn.__name__
-        assert own.line == fn.__code__.co_firstlineno + 1
