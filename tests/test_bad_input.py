@@ -1,6 +1,7 @@
 """Terms and states that do not fit get an error that says what to pass instead."""
 
 import dataclasses
+import functools as ft
 from typing import NamedTuple
 
 import diffrax
@@ -44,6 +45,10 @@ def _from(y0, solver=None):
     return _pairs(_of_q, y0=y0, solver=solver)[0]
 
 
+def _made(*given):
+    return [lambda: ds.hamiltonian_terms(*given)]
+
+
 class Pair(NamedTuple):
     p: jax.Array
     q: jax.Array
@@ -82,6 +87,7 @@ PATH = ds.WeakBrownianPath((), jr.key(0))
 ONES = jnp.ones(2)
 DECAY = diffrax.ODETerm(lambda t, y, args: y)
 IMAGINARY = 1j * ONES
+SINGLE = jax.ShapeDtypeStruct((2,), jnp.float32)
 # From a message to what is answered by it.
 OF_TERMS = {
     r"pass `y0=\(p0, q0\)`": [
@@ -107,31 +113,19 @@ OF_TERMS = {
     r"must return a scalar.*got shape \(3,\)": _pairs(
         _of_q, H0=lambda t, p, q, args: p
     ),
-    r"got \[f32\[2\], 3\]\.": [
-        lambda: ds.WeakBrownianPath(
-            [jax.ShapeDtypeStruct((2,), jnp.float32), 3], jr.key(0)
-        )
-    ],
-    r"a tuple of integers, `\(m,\)` for `m`": [
+    r"got \[f32\[2\], 3\]\.": [lambda: ds.WeakBrownianPath([SINGLE, 3], jr.key(0))],
+    r"a tuple of integers, `\(m,\)` for": [
         lambda: ds.WeakBrownianPath((-1,), jr.key(0))
     ],
-    "`path` must be a Brownian path": [
-        lambda: ds.hamiltonian_terms(_total, _total, lambda t0, t1: 0.0)  # pyright: ignore
-    ],
-    "`H0` must be a function": [
-        lambda: ds.hamiltonian_terms(1.0, _total, PATH)  # pyright: ignore
-    ],
-    "got the class WeakBrownianPath": [
-        lambda: ds.hamiltonian_terms(_total, _total, ds.WeakBrownianPath)  # pyright: ignore
-    ],
-    "got a NoneType.*pass neither": [lambda: ds.hamiltonian_terms(_total, _total)],
-    "`noise` must be a function": [lambda: ds.hamiltonian_terms(_total, None, PATH)],
-    r"called as `H0\(t, p, q, args\)`; got a fun": [
-        lambda: ds.hamiltonian_terms(lambda p, q: p * q, _total, PATH)  # pyright: ignore
-    ],
+    "`path` must be a Brownian path": _made(_total, _total, lambda t0, t1: 0.0),
+    "`H0` must be a function": _made(1.0, _total, PATH),
+    "got the class WeakBrownianPath": _made(_total, _total, ds.WeakBrownianPath),
+    "got a NoneType.*pass neither": _made(_total, _total),
+    "`noise` must be a function": _made(_total, None, PATH),
+    r"called as `H0\(t, p, q, args\)`; got a fun": _made(lambda p, q: 0, _total, PATH),
     r"`noise` is called as .*another order, `\(t, [qx]": [
-        lambda swapped=swapped: ds.hamiltonian_terms(_total, swapped, PATH)
-        for swapped in (lambda t, q, p, args: q, lambda t, x, v, args: x)
+        *_made(_total, lambda t, q, p, args: q, PATH),
+        *_made(_total, lambda t, x, v, args: x, PATH),
     ],
     "Both are real; got.*`wave_terms`": [
         _from(y0, solver)
@@ -146,9 +140,7 @@ OF_TERMS = {
     "the same dtype": [_in_single_precision_with_double],
     r"is a pair `\(p, q\)`": [_from(Pair(ONES, ONES))],
     "float32 or float64": [_in_half_precision],
-    "also inherit from `diffrax_symplectic.AbstractImplicitStages`": [
-        _from((ONES, ONES), Mine())
-    ],
+    "also inherit from `.*AbstractImplicitStages`": [_from((ONES, ONES), Mine())],
     "must be a Lineax operator": [_with_matrices],
 }
 CALLS_OF_TERMS = [(message, x) for message, calls in OF_TERMS.items() for x in calls]
@@ -300,112 +292,88 @@ class _Parameters:
     stiffness: float = 1.0
 
 
-def _generator():
-    yield 1.0
-
-
 DEVICE = jax.devices()[0]
 TWO_KEYS = jr.split(jr.key(0), 2)
 OLD_KEYS = jr.split(jr.PRNGKey(0), 2)
 HUGE = 10**12
+PATHS = ds.IndependentPaths(64, HUGE), ds.ValueFunctions(1, 64, HUGE)
+LONG = dict(num_paths=10**9, ts=np.linspace(0.5, 5000, 10_000), t1=5000)
+
+
+def _each(fn, **values):
+    """Calls with each of these values of an argument."""
+    pairs = [{name: x} for name, xs in values.items() for x in xs]
+    return [ft.partial(fn, **pair) for pair in pairs]
+
+
 # From a message to calls that are answered by it. None of them compiles a program.
 REFUSED = {
-    "`confidence` must be a number between 0 and 1, such as 0.95": [
-        lambda: _drawn().interval(95),
-        lambda: _drawn().interval(float("nan")),
-        lambda: _drawn().interval("0.95"),  # pyright: ignore
-        lambda: _drawn().interval(np.array([0.5, 0.9])),  # pyright: ignore
-    ],
-    "`tol` must be a positive number": [
-        lambda: _mean(tol=True),
-        lambda: _mean(tol=1e-320),
-        lambda: _drawn(tol=jnp.ones(2)),
-    ],
+    "`confidence` must be a number between 0 and 1, such as 0.95": _each(
+        lambda confidence: _drawn().interval(confidence),
+        confidence=[95, float("nan"), "0.95", np.array([0.5, 0.9])],
+    ),
+    "`tol` must be a positive number": _each(_mean, tol=[True, 1e-320, ONES]),
     "`devices` must be a list of one or more devices": [
-        lambda: _drawn(devices=[]),
-        lambda: _mean(devices="cpu"),
-        lambda: _mean(devices=DEVICE),
+        *_each(_mean, devices=["cpu", DEVICE]),
+        *_each(_drawn, devices=[[]]),
     ],
-    "`devices` must differ": [lambda: _drawn(devices=[DEVICE, DEVICE])],
+    "`devices` must differ": _each(_drawn, devices=[[DEVICE, DEVICE]]),
     "`(expectation|ensemble|monte_carlo|compare_solvers)` needs one random key": [
         call
-        for keys in (TWO_KEYS, OLD_KEYS)
-        for call in (
-            lambda: _mean(key=keys),
-            lambda: _paths(key=keys),
-            lambda: _drawn(key=keys),
-            lambda: _compared(key=keys),
-        )
+        for fn in (_mean, _paths, _drawn, _compared)
+        for call in _each(fn, key=[TWO_KEYS, OLD_KEYS])
     ],
-    "`expectation` needs a random key": [lambda: _mean(key=3)],
-    "`compare_solvers` needs a random key": [
-        lambda: _compared(key=None),
-    ],
+    "`expectation` needs a random key": _each(_mean, key=[3]),
+    "`compare_solvers` needs a random key": _each(_compared, key=[None]),
     "`first` must be an integer from 0 to": [
-        lambda: _drawn(first=2**64),
-        lambda: _mean(first=2**63),
+        *_each(_drawn, first=[2**64]),
+        *_each(_mean, first=[2**63]),
     ],
-    "Samples have numbers below 2": [
-        lambda: _drawn(first=2**63 - 8),
-        lambda: _drawn(num_paths=2**70),
-    ],
-    "`levels` must be an integer from 1 to": [
-        lambda: _mean(levels=2000),
-        lambda: _mean(levels=0),
-    ],
+    "Samples have numbers below 2": _each(_drawn, first=[2**63 - 8], num_paths=[2**70]),
+    "`levels` must be an integer from 1 to": _each(_mean, levels=[2000, 0]),
     "paths take .* GB or more, of .* GB. Pass a smaller `batch_size`": [
-        lambda: _mean(sampling=ds.IndependentPaths(64, HUGE)),
-        lambda: _mean(sampling=ds.ValueFunctions(1, 64, HUGE)),
+        *_each(_mean, sampling=PATHS),
         lambda: _drawn(num_paths=HUGE, batch_size=HUGE),
     ],
     "paths take .* GB or more, of .* GB. Pass a smaller `num_paths`": [
-        lambda: _mean(sampling=ds.ArrayRQMC(2**40)),
-        lambda: _paths(num_paths=HUGE),
-        lambda: _paths(num_paths=10**9, ts=np.linspace(0.5, 5000, 10_000), t1=5000),
-        lambda: _compared(num_paths=HUGE),
+        *_each(_mean, sampling=[ds.ArrayRQMC(2**40)]),
+        *_each(_paths, num_paths=[HUGE]),
+        lambda: _paths(**LONG),
+        *_each(_compared, num_paths=[HUGE]),
     ],
-    "`num_paths` must be an integer, 2 or larger": [
-        lambda: _compared(num_paths=0),
-        lambda: _compared(num_paths="many"),
-    ],
+    "`num_paths` must be an integer, 2 or larger": _each(
+        _compared, num_paths=[0, "many"]
+    ),
     "must return arrays with one entry or more": [
         lambda: _mean(lambda t, y, args: {"one": y[1], "none": jnp.zeros((2, 0))}),
         lambda: _drawn(lambda key: jr.normal(key, (0,))),
     ],
     "`terms` must be Diffrax terms.*several in a `diffrax.MultiTerm.*got": [
         call
-        for terms in ([TERMS], (TERMS,), {"a": TERMS}, TERMS.terms, None)
-        for call in (
-            lambda terms=terms: _mean(terms=terms),
-            lambda terms=terms: _paths(terms=terms),
-        )
+        for fn in (_mean, _paths)
+        for call in _each(fn, terms=[[TERMS], (TERMS,), {"a": TERMS}, None])
     ],
     "`solver` must take fixed steps and be for equations with noise": [
-        lambda: _mean(solver=diffrax.Tsit5()),
-        lambda: _paths(solver=diffrax.Kvaerno3()),
-        lambda: _mean(solver=diffrax.HalfSolver(ds.StormerVerlet())),
+        *_each(_mean, solver=[diffrax.Tsit5(), diffrax.HalfSolver(ds.StormerVerlet())]),
+        *_each(_paths, solver=[diffrax.Kvaerno3()]),
     ],
-    "`solvers` must be a list of one or more solvers": [
-        lambda: _compared(solvers=[]),
-        lambda: _compared(solvers=ds.StormerVerlet()),
-    ],
+    "`solvers` must be a list of one or more solvers": _each(
+        _compared, solvers=[[], ds.StormerVerlet()]
+    ),
     "`y0` must hold numbers and arrays of numbers.*got a": [
         call
-        for y0 in ("rest", ("a", "b"), {0.0, 1.0}, _Parameters(), _generator())
-        for call in (
-            lambda y0=y0: _mean(y0=y0),
-            lambda y0=y0: _paths(y0=lambda key: y0),
-            lambda y0=y0: _compared(y0=y0),
-            lambda y0=y0: ds.suggest_solver(TERMS, 0.0, y0, want="weak"),
+        for fn in (
+            _mean,
+            lambda y0: _paths(y0=lambda key: y0),
+            _compared,
+            lambda y0: ds.suggest_solver(TERMS, 0.0, y0, want="weak"),
         )
+        for call in _each(fn, y0=["rest", ("a", "b"), {0.0, 1.0}, _Parameters()])
     ],
     "`args` must hold arrays.*got a": [
         call
-        for args in ({1.0}, (1.0, {2}), _Parameters(), _generator(), np.array(["a"]))
-        for call in (
-            lambda args=args: _mean(args=args),
-            lambda args=args: _paths(args=lambda key: args),
-        )
+        for fn in (_mean, lambda args: _paths(args=lambda key: args))
+        for call in _each(fn, args=[(1.0, {2}), _Parameters(), np.array(["a"])])
     ],
 }
 CALLS = [(message, call) for message, calls in REFUSED.items() for call in calls]
