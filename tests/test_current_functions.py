@@ -207,27 +207,10 @@ def paths():
     return ds.ensemble(still(()), *STEPS, key=jr.key(0), num_paths=2).ys[1][0]
 
 
-def of_key(key):
-    path = ds.WeakBrownianPath((), key)
-    return diffrax.diffeqsolve(still(path), *STEPS).ys[1][-1]
-
-
-def step_by_step():
-    y = STEPS[-1]
-    path = ds.WeakBrownianPath((), jr.key(0))
-    both = lambda t, y, args: y
-    for t in range(4):
-        times = t / 4, (t + 1) / 4
-        y = ds.step_expectation(still(path), ds.StormerVerlet(), *times, y, fn=both)
-    return y[1]
-
-
 CALLS = {
     "IndependentPaths": lambda: mean(ds.IndependentPaths(2)),
     "ArrayRQMC": lambda: mean(ds.ArrayRQMC(4, 2, sort_by=sorted_by)),
     "ensemble": paths,
-    "monte_carlo": lambda: ds.monte_carlo(of_key, key=jr.key(0), num_paths=2).mean,
-    "step_expectation": step_by_step,
 }
 
 

@@ -74,11 +74,8 @@ def test_code_of_a_page_runs_from_top_to_bottom(
         exec(compile(code, f"{page}, block {number}", "exec"), namespace)
 
 
-def test_the_first_program_of_every_page_has_64_bits():
+def test_every_page_starts_with_64_bits_and_takes_no_path_that_repeats_its_noise():
     assert all("jax_enable_x64" in blocks[0] for blocks in PAGES.values())
-
-
-def test_no_code_takes_a_path_that_repeats_its_noise():
     shown = [*PAGES.values(), *DOCSTRINGS.values()]
     assert not any("UnsafeBrownianPath" in code for blocks in shown for code in blocks)
     faq = (ROOT / "docs" / "faq.md").read_text()

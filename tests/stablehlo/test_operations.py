@@ -173,6 +173,8 @@ CASES = {
     "scatter of each path, which adds": (lambda x, y, i: x.at[1, i % 3].add(y), [(F, (2, 3)), (F, (2,)), (U, (2,))], None),
     "scatter with a batch axis": (jax.vmap(lambda x, i: x.at[i % 3].set(7.0)), [(F, (2, 3)), (U, (2,))], 0),
     "select": (lambda b, x, y: jnp.where(b, x, y), [(B, ()), (F, ()), (F, ())], 0),
+    # The product needs an axis.
+    "select by a scalar": (lambda b, x: jnp.where(b, x, 0) @ jnp.ones((1, 2), x.dtype), [(B, ()), (F, (1,))], 0),
     "shift_left": (lax.shift_left, [(U, ()), (U, ())], 0),
     "shift_left of signed numbers": (lax.shift_left, [(I, ()), (I, ())], 0),
     "shift_right_arithmetic": (lax.shift_right_arithmetic, [(I, ()), (I, ())], 0),
@@ -355,15 +357,3 @@ def test_every_operation_of_the_table_is_tested():
     elsewhere = {"custom_call", "complex", "imag", "real", "sharding_constraint"}
     names = {*elementwise(), *complex_functions(), *RULES}
     assert names == tested | elsewhere
-
-
-def test_a_selection_by_a_scalar_keeps_the_axis_of_a_single_entry():
-    yes, x = values(B, (), bool, 0), values(F, (1,), np.float64, 2)
-    x[~np.isfinite(x)] = 0.5
-
-    def fn(yes, x):
-        # The product needs an axis.
-        return jnp.where(yes, x, 0) @ jnp.ones((1, 2))
-
-    (actual,) = replayed(fn, yes, x)
-    np.testing.assert_array_equal(actual, np.where(yes, x[:, 0], 0)[:, None] * [1, 1])
