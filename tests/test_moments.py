@@ -1,7 +1,6 @@
 """Second moments on linear models, exactly: one step, and whole solves."""
 
 from collections.abc import Callable
-from typing import ClassVar
 
 import diffrax
 import jax
@@ -191,21 +190,11 @@ def test_a_failed_step_has_no_expectation_and_says_why():
         ds.step_expectation(*given, jnp.nan, fn=lambda t, y, args: y[0])
 
 
-class _NoiseInTwoPlaces(ds.AbstractSymplecticSolver):
+class _NoiseInTwoPlaces(diffrax.EulerHeun):
     """Only noise, as the sum of two parts of it."""
 
     parts: Callable
-    structure: ClassVar[str] = "separable"
-    variables: ClassVar[tuple[str, ...]] = ("W", "H")
-
-    def stage_vectors(self, num_noises):
-        return ()
-
-    def order(self, terms):
-        return 1
-
-    def init(self, terms, t0, t1, y0, args):
-        return None
+    minimal_levy_area = diffrax.AbstractSpaceTimeLevyArea
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         y1 = self.parts(terms.terms[1], t0, t1)

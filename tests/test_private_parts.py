@@ -2,7 +2,6 @@
 tests fails after an upgrade, its name says what broke; other failures follow from it."""
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
@@ -81,18 +80,6 @@ def test_the_default_generator_is_known_by_its_name():
     other numbers for the same key. Find the new name of Threefry."""
     assert _compat.is_threefry(jax.random.key(0, impl="threefry2x32"))
     assert not _compat.is_threefry(jax.random.key(0, impl="rbg"))
-
-
-def test_solvers_of_lineax_compute_without_linear_solve():
-    """If this fails: call `lineax.linear_solve(..., throw=False)`."""
-    A = jnp.array([[2.0, 1.0], [0.0, 4.0]])
-    struct = jax.ShapeDtypeStruct((2,), A.dtype)
-    operator = lx.FunctionLinearOperator(lambda x: A @ x, struct)
-    solve = eqx.filter_jit(_compat.linear_solution)
-    for solver in (lx.LU(), lx.GMRES(1e-6, 1e-6)):
-        x, result = solve(solver, operator, jnp.array([4.0, 4.0]))
-        assert result == lx.RESULTS.successful
-        assert jnp.allclose(x, jnp.array([1.5, 1.0]), atol=1e-5)
 
 
 def test_results_of_all_solves_are_told_from_other_values():
