@@ -324,6 +324,7 @@ REFUSED = {
         for call in _each(fn, key=[TWO_KEYS, OLD_KEYS])
     ],
     "`expectation` needs a random key": _each(_mean, key=[3]),
+    "`ensemble` needs a random key": _each(_paths, key=[3]),
     "`compare_solvers` needs a random key": _each(_compared, key=[None]),
     "`first` must be an integer from 0 to": [
         *_each(_drawn, first=[2**64]),
