@@ -30,6 +30,9 @@ def _of_q(t, p, q, args):
     return q[:1]
 
 
+DECAY = diffrax.ODETerm(lambda t, y, args: y)
+
+
 def _pairs(*noises, H0=_total, solver=None, y0=None, m=1):
     """Solves of a pair of arrays of three numbers with these noises."""
     y0 = (jnp.ones(3), jnp.ones(3)) if y0 is None else y0
@@ -63,29 +66,21 @@ class Mine(ds.AbstractSymplecticRungeKutta):
 
 def _with_matrices():
     matrices = lambda t, y, args: (jnp.ones((3, 2)), jnp.zeros((3, 2)))
-    drift = diffrax.ODETerm(lambda t, y, args: y)
     noise = diffrax.ControlTerm(matrices, weak_path(2))
-    _solve(diffrax.MultiTerm(drift, noise), (jnp.zeros(3), jnp.ones(3)))
+    _solve(diffrax.MultiTerm(DECAY, noise), (jnp.zeros(3), jnp.ones(3)))
 
 
-def _in_single_precision_with_double():
-    field = lambda t, y, args: jnp.ones((2, 1))
-    drift = diffrax.ODETerm(lambda t, y, args: y)
-    terms = diffrax.MultiTerm(drift, diffrax.ControlTerm(field, weak_path(1)))
-    t0, t1, h = np.array([0, 0.2, 0.1], np.float32)
-    y0 = jnp.ones(2, np.float32)
-    diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), t0, t1, h, y0)
-
-
-def _in_half_precision():
-    y0 = jnp.ones(1, jnp.float16), jnp.ones(1, jnp.float16)
-    terms = ds.hamiltonian_terms(_total, _of_q, weak_path(1))
-    ds.ImplicitMidpoint().init(terms, 0.0, 0.1, y0, None)
+def _solve_in(dtype):
+    """With a path in double precision."""
+    noise = diffrax.ControlTerm(lambda t, y, args: jnp.ones((2, 1)), weak_path(1))
+    t0, t1, h = np.array([0, 0.2, 0.1], dtype)
+    terms = diffrax.MultiTerm(DECAY, noise)
+    y0 = jnp.ones(2, dtype)
+    return [lambda: diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), t0, t1, h, y0)]
 
 
 PATH = ds.WeakBrownianPath((), jr.key(0))
 ONES = jnp.ones(2)
-DECAY = diffrax.ODETerm(lambda t, y, args: y)
 IMAGINARY = 1j * ONES
 SINGLE = jax.ShapeDtypeStruct((2,), jnp.float32)
 # From a message to what is answered by it.
@@ -137,9 +132,9 @@ OF_TERMS = {
         lambda: ds.ImplicitMidpoint().init(DECAY, 0.0, 0.1, jnp.ones(2, int), None)
     ],
     "at least one array": [lambda: _solve(DECAY, ())],
-    "the same dtype": [_in_single_precision_with_double],
+    "the same dtype": _solve_in(np.float32),
     r"is a pair `\(p, q\)`": [_from(Pair(ONES, ONES))],
-    "float32 or float64": [_in_half_precision],
+    "float32 or float64": _solve_in(np.float16),
     "also inherit from `.*AbstractImplicitStages`": [_from((ONES, ONES), Mine())],
     "must be a Lineax operator": [_with_matrices],
 }

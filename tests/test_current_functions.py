@@ -183,34 +183,20 @@ def spring(t, p, q, args):
     return (p**2 + k * q**2) / 2
 
 
-def position(t, y, args):
-    return y[1]
-
-
-def sorted_by(y):
-    return k * y[1]
-
-
 STEPS = ds.StormerVerlet(), 0, 1, 0.25, (0 * ONE, ONE)
-
-
-def still(path):
-    return ds.hamiltonian_terms(spring, lambda t, p, q, args: 0.0 * q, path)
+STILL = ds.hamiltonian_terms(spring, lambda t, p, q, args: 0.0 * q, ())
 
 
 def mean(sampling):
-    given = position, still(()), *STEPS
+    position = lambda t, y, args: y[1]
+    given = position, STILL, *STEPS
     return ds.expectation(*given, key=jr.key(0), levels=1, sampling=sampling).mean
-
-
-def paths():
-    return ds.ensemble(still(()), *STEPS, key=jr.key(0), num_paths=2).ys[1][0]
 
 
 CALLS = {
     "IndependentPaths": lambda: mean(ds.IndependentPaths(2)),
-    "ArrayRQMC": lambda: mean(ds.ArrayRQMC(4, 2, sort_by=sorted_by)),
-    "ensemble": paths,
+    "ArrayRQMC": lambda: mean(ds.ArrayRQMC(4, 2, sort_by=lambda y: k * y[1])),
+    "ensemble": lambda: ds.ensemble(STILL, *STEPS, key=jr.key(0), num_paths=2).ys[1][0],
 }
 
 

@@ -207,6 +207,9 @@ def test_code_of_a_path_makes_the_path():
         for s in ds.suggest_solver(terms, 0.0, y0, want=want):
             made = brownian_paths(s.terms(jr.key(3)))[0]
             assert eqx.tree_equal(eval(s.path, names), made)
+    # A half solver gets a Gaussian path.
+    half = own_path(diffrax.HalfSolver(ds.StormerVerlet()), "weak", (), jr.key(0))
+    assert type(half) is ds.FixedStepBrownianPath
     # Shapes are written with their precision.
     shapes = [jax.ShapeDtypeStruct((2,), x) for x in (jnp.float32, jnp.float64)]
     for shape in shapes:
@@ -269,12 +272,6 @@ def test_each_shape_of_a_path_is_a_brownian_motion_of_its_own():
         terms = _driven(first, shape, shape)
         keys = _keys(with_paths_for_shapes(terms, ds.WeakBrownianPath))
         assert len(set.union(*keys)) == 3
-
-
-def test_a_half_solver_gets_a_gaussian_path():
-    solver = diffrax.HalfSolver(ds.StormerVerlet())
-    path = own_path(solver, "weak", (), jr.key(0))
-    assert type(path) is ds.FixedStepBrownianPath
 
 
 ONE = jnp.ones(())

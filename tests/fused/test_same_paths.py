@@ -92,7 +92,6 @@ PATHS = {
         lambda key: ds.WeakBrownianPath((2,), key, order=3, two_point=True),
     ),
     "Gaussian, with a solver of Diffrax": (diffrax.Heun(), gaussian),
-    "Gaussian of cells": (VERLET, lambda key: gaussian(key, cell=H / 4)),
     "truncated": (VERLET, lambda key: ds.TruncatedBrownianPath(gaussian(key))),
     "tree": (VERLET, tree),
     "truncated tree": (VERLET, lambda key: ds.TruncatedBrownianPath(tree(key))),
