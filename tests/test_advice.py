@@ -139,7 +139,7 @@ def test_two_levels_hold_up_to_the_frequency_of_the_record(kind):
     kubo = lambda t, p, q, args: 0.27 * (p**2 + q**2) / 2
     terms = ds.hamiltonian_terms(_well, kubo, path)
     hs = most * np.array([0.5, 1.0, 2.0])
-    maps = _maps(terms, with_newton(kind()), jnp.asarray(hs))
+    maps = _maps(terms, by_picard(kind()), jnp.asarray(hs))
     # Of q + i p, which each step multiplies by a number in the mean: q is the third of the
     # moments of (1, p, q), and becomes the real part, p the imaginary part.
     half, one, two = maps[:, 2, 2] + 1j * maps[:, 1, 2]
