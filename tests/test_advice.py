@@ -14,6 +14,7 @@ from examples.stability import friction
 from examples.stability._models import stationary, with_newton
 
 from .families import slow_except
+from .picard import by_picard
 
 
 ONE = jnp.array(0.5), jnp.array(1.0)
@@ -36,8 +37,8 @@ def _well(t, p, q, args):
     return (p**2 + q**2) / 2
 
 
-def _maps(terms, solver, hs):
-    one = lambda h: ds.second_moment_map(terms, solver, 0.0, h, ONE)
+def _maps(terms, solver, hs, y0=ONE):
+    one = lambda h: ds.second_moment_map(terms, solver, 0.0, h, y0)
     options = {"xla_backend_optimization_level": 0}
     return np.asarray(jax.jit(jax.vmap(one), compiler_options=options)(hs))
 
@@ -73,23 +74,14 @@ def test_facts_about_noise_on_harmonic_modes_are_measured(kind):
     assert kind().record.stationary == tuple(exact)
 
 
-def _solver_name(solver) -> str:
-    """Its class, and that of the solver within."""
-    inner = ""
-    if isinstance(solver, ds.BAOAB) and solver.flow is not None:
-        inner = _solver_name(solver.flow)
-    return f"{type(solver).__name__}({inner})"
-
-
-def _names(found) -> set[str]:
-    return {_solver_name(suggestion.solver) for suggestion in found}
-
-
 def test_friction_is_measured_for_all_solvers_suggested_for_it():
+    # Its class, and that of the solver within.
+    name = lambda solver: (type(solver), type(getattr(solver, "flow", None)))
     terms = ds.langevin_terms(_well, 0.5, 1.0, ())
-    measured = {_solver_name(solver) for solver in friction.CASES.values()}
+    measured = {name(solver) for solver in friction.CASES.values()}
     for want in ("weak", "strong"):
-        assert _names(ds.suggest_solver(terms, 0.0, ONE, want=want)) <= measured
+        found = ds.suggest_solver(terms, 0.0, ONE, want=want)
+        assert {name(suggestion.solver) for suggestion in found} <= measured
 
 
 FIRST = list(friction.CASES)[:2]
@@ -119,7 +111,7 @@ def test_reasons_say_which_solver_is_for_functions_of_momenta_and_positions():
     for kind in (ds.BAOAB, ds.LangevinMiddle):
         path = kind().path((2,), jr.key(0), want="weak")
         terms = ds.langevin_terms(pair, 0.5, jnp.array([1.5, 0.5]), path)
-        K = np.asarray(ds.second_moment_map(terms, kind(), 0.0, h, zero))
+        (K,) = _maps(terms, kind(), jnp.array([h]), zero)
         # Of (1, p, p', q, q').
         moments = stationary(K, 1.0).reshape(5, 5)
         p, q = moments[1:3], moments[3:]
@@ -147,7 +139,7 @@ def test_two_levels_hold_up_to_the_frequency_of_the_record(kind):
     kubo = lambda t, p, q, args: 0.27 * (p**2 + q**2) / 2
     terms = ds.hamiltonian_terms(_well, kubo, path)
     hs = most * np.array([0.5, 1.0, 2.0])
-    maps = _maps(terms, with_newton(kind()), jnp.asarray(hs))
+    maps = _maps(terms, by_picard(kind()), jnp.asarray(hs))
     # Of q + i p, which each step multiplies by a number in the mean: q is the third of the
     # moments of (1, p, q), and becomes the real part, p the imaginary part.
     half, one, two = maps[:, 2, 2] + 1j * maps[:, 1, 2]
@@ -167,20 +159,17 @@ def test_two_levels_hold_up_to_the_frequency_of_the_record(kind):
 
 def test_without_brackets_levy_areas_change_nothing():
     """So the facts about noise on harmonic modes are those of the midpoint rule."""
-    hs = jnp.concatenate([RESOLVED, STIFF])
     push = lambda t, p, q, args: jnp.stack([-q, -2 * q])
     path = ds.LevyAreaMidpoint().path((2,), jr.key(0), want="strong")
     terms = ds.hamiltonian_terms(_well, push, path)
-    ends = []
-    for solver in (ds.LevyAreaMidpoint(), ds.ImplicitMidpoint()):
-        solver = with_newton(solver)
+    solvers = ds.LevyAreaMidpoint(), ds.ImplicitMidpoint()
 
-        def end(h, solver=solver):
-            state = solver.init(terms, 0.0, h, ONE, None)
-            return solver.step(terms, 0.0, h, ONE, None, state, made_jump=False)[0]
+    @jax.jit
+    def ends(h):
+        given = terms, 0.0, h, ONE, None, None, False
+        return [jnp.stack(by_picard(solver).step(*given)[0]) for solver in solvers]
 
-        ends.append(jnp.stack(jax.jit(jax.vmap(end))(hs)))
-    np.testing.assert_allclose(*ends, rtol=0, atol=1e-13)
-    of_levy, of_midpoint = ds.LevyAreaMidpoint.record, ds.ImplicitMidpoint.record
+    np.testing.assert_allclose(*ends(0.5), rtol=0, atol=1e-13)
+    of_levy, of_midpoint = (solver.record for solver in solvers)
     assert of_levy.right_energy_unresolved is of_midpoint.right_energy_unresolved
     assert of_levy.stationary == of_midpoint.stationary

@@ -1,6 +1,7 @@
 """Terms and states that do not fit get an error that says what to pass instead."""
 
 import dataclasses
+import functools as ft
 from typing import NamedTuple
 
 import diffrax
@@ -29,6 +30,9 @@ def _of_q(t, p, q, args):
     return q[:1]
 
 
+DECAY = diffrax.ODETerm(lambda t, y, args: y)
+
+
 def _pairs(*noises, H0=_total, solver=None, y0=None, m=1):
     """Solves of a pair of arrays of three numbers with these noises."""
     y0 = (jnp.ones(3), jnp.ones(3)) if y0 is None else y0
@@ -42,6 +46,10 @@ def _pairs(*noises, H0=_total, solver=None, y0=None, m=1):
 
 def _from(y0, solver=None):
     return _pairs(_of_q, y0=y0, solver=solver)[0]
+
+
+def _made(*given):
+    return [lambda: ds.hamiltonian_terms(*given)]
 
 
 class Pair(NamedTuple):
@@ -58,30 +66,23 @@ class Mine(ds.AbstractSymplecticRungeKutta):
 
 def _with_matrices():
     matrices = lambda t, y, args: (jnp.ones((3, 2)), jnp.zeros((3, 2)))
-    drift = diffrax.ODETerm(lambda t, y, args: y)
     noise = diffrax.ControlTerm(matrices, weak_path(2))
-    _solve(diffrax.MultiTerm(drift, noise), (jnp.zeros(3), jnp.ones(3)))
+    _solve(diffrax.MultiTerm(DECAY, noise), (jnp.zeros(3), jnp.ones(3)))
 
 
-def _in_single_precision_with_double():
-    field = lambda t, y, args: jnp.ones((2, 1))
-    drift = diffrax.ODETerm(lambda t, y, args: y)
-    terms = diffrax.MultiTerm(drift, diffrax.ControlTerm(field, weak_path(1)))
-    t0, t1, h = np.array([0, 0.2, 0.1], np.float32)
-    y0 = jnp.ones(2, np.float32)
-    diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), t0, t1, h, y0)
-
-
-def _in_half_precision():
-    y0 = jnp.ones(1, jnp.float16), jnp.ones(1, jnp.float16)
-    terms = ds.hamiltonian_terms(_total, _of_q, weak_path(1))
-    ds.ImplicitMidpoint().init(terms, 0.0, 0.1, y0, None)
+def _solve_in(dtype):
+    """With a path in double precision."""
+    noise = diffrax.ControlTerm(lambda t, y, args: jnp.ones((2, 1)), weak_path(1))
+    t0, t1, h = np.array([0, 0.2, 0.1], dtype)
+    terms = diffrax.MultiTerm(DECAY, noise)
+    y0 = jnp.ones(2, dtype)
+    return [lambda: diffrax.diffeqsolve(terms, ds.ImplicitMidpoint(), t0, t1, h, y0)]
 
 
 PATH = ds.WeakBrownianPath((), jr.key(0))
 ONES = jnp.ones(2)
-DECAY = diffrax.ODETerm(lambda t, y, args: y)
 IMAGINARY = 1j * ONES
+SINGLE = jax.ShapeDtypeStruct((2,), jnp.float32)
 # From a message to what is answered by it.
 OF_TERMS = {
     r"pass `y0=\(p0, q0\)`": [
@@ -98,7 +99,6 @@ OF_TERMS = {
     ],
     "one Hamiltonian for each noise of the path": _pairs(
         lambda t, p, q, args: q,
-        lambda t, p, q, args: jnp.outer(q, q),
         lambda t, p, q, args: jnp.sum(q),
         lambda t, p, q, args: (jnp.sum(q),) * 2,
         m=2,
@@ -108,36 +108,19 @@ OF_TERMS = {
     r"must return a scalar.*got shape \(3,\)": _pairs(
         _of_q, H0=lambda t, p, q, args: p
     ),
-    r"got \[f32\[2\], 3\]\.": [
-        lambda: ds.WeakBrownianPath(
-            [jax.ShapeDtypeStruct((2,), jnp.float32), 3], jr.key(0)
-        )
-    ],
-    r"a tuple of integers, `\(m,\)` for `m`": [
+    r"got \[f32\[2\], 3\]\.": [lambda: ds.WeakBrownianPath([SINGLE, 3], jr.key(0))],
+    r"a tuple of integers, `\(m,\)` for": [
         lambda: ds.WeakBrownianPath((-1,), jr.key(0))
     ],
-    "`path` must be a Brownian path": [
-        lambda: ds.hamiltonian_terms(_total, _total, lambda t0, t1: 0.0)  # pyright: ignore
-    ],
-    "`H0` must be a function": [
-        lambda: ds.hamiltonian_terms(1.0, _total, PATH)  # pyright: ignore
-    ],
-    "got the class WeakBrownianPath": [
-        lambda: ds.hamiltonian_terms(_total, _total, ds.WeakBrownianPath)  # pyright: ignore
-    ],
-    "got a NoneType.*pass neither": [lambda: ds.hamiltonian_terms(_total, _total)],
-    "`noise` must be a function": [lambda: ds.hamiltonian_terms(_total, None, PATH)],
-    r"called as `H0\(t, p, q, args\)`; got a fun": [
-        lambda: ds.hamiltonian_terms(lambda p, q: p * q, _total, PATH)  # pyright: ignore
-    ],
+    "`path` must be a Brownian path": _made(_total, _total, lambda t0, t1: 0.0),
+    "`H0` must be a function": _made(1.0, _total, PATH),
+    "got the class WeakBrownianPath": _made(_total, _total, ds.WeakBrownianPath),
+    "got a NoneType.*pass neither": _made(_total, _total),
+    "`noise` must be a function": _made(_total, None, PATH),
+    r"called as `H0\(t, p, q, args\)`; got a fun": _made(lambda p, q: 0, _total, PATH),
     r"`noise` is called as .*another order, `\(t, [qx]": [
-        lambda swapped=swapped: ds.hamiltonian_terms(_total, swapped, PATH)
-        for swapped in (
-            lambda t, q, p, args: q,
-            lambda t, x, v, args: x,
-            lambda t, x, p, args: x,
-            lambda t, q, v, args: q,
-        )
+        *_made(_total, lambda t, q, p, args: q, PATH),
+        *_made(_total, lambda t, x, v, args: x, PATH),
     ],
     "Both are real; got.*`wave_terms`": [
         _from(y0, solver)
@@ -149,12 +132,10 @@ OF_TERMS = {
         lambda: ds.ImplicitMidpoint().init(DECAY, 0.0, 0.1, jnp.ones(2, int), None)
     ],
     "at least one array": [lambda: _solve(DECAY, ())],
-    "the same dtype": [_in_single_precision_with_double],
+    "the same dtype": _solve_in(np.float32),
     r"is a pair `\(p, q\)`": [_from(Pair(ONES, ONES))],
-    "float32 or float64": [_in_half_precision],
-    "also inherit from `diffrax_symplectic.AbstractImplicitStages`": [
-        _from((ONES, ONES), Mine())
-    ],
+    "float32 or float64": _solve_in(np.float16),
+    "also inherit from `.*AbstractImplicitStages`": [_from((ONES, ONES), Mine())],
     "must be a Lineax operator": [_with_matrices],
 }
 CALLS_OF_TERMS = [(message, x) for message, calls in OF_TERMS.items() for x in calls]
@@ -171,7 +152,8 @@ def test_other_names_and_integers_will_do():
     for other in (lambda t, mom, pos, args: pos, lambda *args: args[2]):
         ds.hamiltonian_terms(_total, other, PATH)
     # Diffrax itself turns an integer state into a floating-point one.
-    assert jnp.issubdtype(_solve(DECAY, jnp.ones(2, int)).ys.dtype, jnp.floating)
+    end = jax.eval_shape(lambda y: _solve(DECAY, y).ys, jnp.ones(2, int))
+    assert jnp.issubdtype(end.dtype, jnp.floating)
 
 
 @pytest.mark.parametrize("solver", [diffrax.Euler(), diffrax.ItoMilstein()])
@@ -199,97 +181,76 @@ def test_ito_solvers_are_refused_where_the_sense_makes_a_difference(solver):
     solve(noise=kick)
 
 
-@pytest.mark.parametrize("solver, m", [(ds.ImplicitMidpoint(), 3), (diffrax.Heun(), 1)])
-def test_noise_that_does_not_depend_on_the_state_is_refused(solver, m):
-    H = lambda t, p, q, args: jnp.sum(p**2 + q**2)
-    y0 = (jnp.ones(2), jnp.ones(2))
+def test_noise_that_does_not_depend_on_the_state_is_refused():
+    m, y0 = 3, (jnp.ones(2), jnp.ones(2))
+    zero_gradient = r"does not depend on the state.*-sigma \* q"
+
+    def solve(noise, args, solver):
+        terms = ds.hamiltonian_terms(_total, noise, weak_path(m, two_point=True))
+        diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0, args)
+
     # An amplitude in place of a Hamiltonian, of which the gradient is zero.
     for amplitude in (
-        lambda t, p, q, args: 0.05 * jnp.ones(m),
         lambda t, p, q, args: args * jnp.cos(t) * jnp.ones(m),
         ds.IndexedNoise(lambda k, t, p, q, args: 0.05, m),
     ):
-        terms = ds.hamiltonian_terms(H, amplitude, weak_path(m, two_point=True))
-        with pytest.raises(
-            ValueError, match=r"does not depend on the state.*-sigma \* q"
-        ):
-            diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0, jnp.array(0.05))
-        with pytest.raises(ValueError, match="does not depend on the state"):
+        for solver in (ds.StormerVerlet(), ds.NinomiyaVictoir(), diffrax.Heun()):
+            with pytest.raises(ValueError, match=zero_gradient):
+                solve(amplitude, jnp.array(0.05), solver)
+        terms = ds.hamiltonian_terms(_total, amplitude, weak_path(m))
+        with pytest.raises(ValueError, match=zero_gradient):
             ds.suggest_solver(terms, 0.0, y0, jnp.array(0.05), want="weak")
-    with pytest.raises(ValueError, match="does not depend on the state"):
-        diffrax.diffeqsolve(terms, ds.NinomiyaVictoir(), 0.0, 0.2, 0.1, y0)
     # What is zero for these values alone is not refused.
     kick = lambda t, p, q, args: -args * q[:1] * jnp.ones(m)
-    terms = ds.hamiltonian_terms(H, kick, weak_path(m))
     for zero in (0.0, jnp.array(0.0)):
-        solve = lambda: diffrax.diffeqsolve(terms, solver, 0.0, 0.2, 0.1, y0, zero).ys
-        jax.eval_shape(solve)
+        for solver in (ds.StormerVerlet(), diffrax.Heun()):
+            jax.eval_shape(lambda: solve(kick, zero, solver))
 
 
-def _branches(t, p, q, args):
-    return jnp.sum(p**2) if p[0] > 0 else jnp.sum(q**2)
+ASKING = {
+    "branches": lambda t, p, q, args: jnp.sum(p**2) if p[0] > 0 else jnp.sum(q**2),
+    "selects": lambda t, p, q, args: jnp.sum(q[p > 0]),
+    "takes numpy": lambda t, p, q, args: np.sum(np.sin(q)),
+    "takes float": lambda t, p, q, args: float(q[0]),
+    "counts": lambda t, p, q, args: jnp.sum(jnp.ones(int(q[0])) * q),
+}
 
 
-def _selects(t, p, q, args):
-    return jnp.sum(q[p > 0])
-
-
-def _takes_numpy(t, p, q, args):
-    return np.sum(np.sin(q))
-
-
-def _takes_float(t, p, q, args):
-    return float(q[0])
-
-
-def _counts(t, p, q, args):
-    return jnp.sum(jnp.ones(int(q[0])) * q)
-
-
-@pytest.mark.parametrize("name", ["H0", "noise"])
-@pytest.mark.parametrize(
-    "asks", [_branches, _selects, _takes_numpy, _takes_float, _counts]
-)
-def test_a_hamiltonian_that_asks_for_values_is_named(name, asks):
-    square = lambda t, p, q, args: jnp.sum(p**2)
-    H0, noise = (asks, square) if name == "H0" else (square, asks)
-    terms = ds.hamiltonian_terms(H0, noise, weak_path(1))
-    with pytest.raises(ValueError, match=f"`{name}` needs concrete.*jnp.where"):
-        _solve(terms, (jnp.ones(2), jnp.ones(2)))
+@pytest.mark.parametrize("asks", ASKING.values(), ids=ASKING)
+def test_a_hamiltonian_that_asks_for_values_is_named(asks):
+    for name, functions in (("H0", (asks, _total)), ("noise", (_total, asks))):
+        terms = ds.hamiltonian_terms(*functions, weak_path(1))
+        with pytest.raises(ValueError, match=f"`{name}` needs concrete.*jnp.where"):
+            _solve(terms, (jnp.ones(2), jnp.ones(2)))
 
 
 def test_a_forgotten_args_is_asked_about():
     H = lambda t, p, q, args: jnp.sum(p**2) + args["k"] * jnp.sum(q**2)
-    plain = lambda t, p, q, args: jnp.sum(q**2)
     one = ds.IndexedNoise(lambda k, t, p, q, args: args["k"] * q[k], 1)
     y0 = (jnp.ones(2), jnp.ones(2))
 
-    def asked(name, kind, call):
-        with pytest.raises(kind) as info:
-            call()
-        asked = [note for note in info.value.__notes__ if "left out" in note]
-        assert asked == [f"`{name}` was called with `args=None`. Was it left out?"]
-        assert "'NoneType' obj" in str(info.value)
+    def calls(phi, *functions):
+        terms = ds.hamiltonian_terms(*functions, weak_path(1))
+        yield lambda: ds.expectation(
+            phi, terms, ds.ImplicitMidpoint(), 0, 1, 0.1, y0, key=jr.key(0)
+        )
+        if phi is first:
+            yield lambda: _solve(terms, y0)
+            yield lambda: ds.suggest_solver(terms, 0, y0, want="strong")
 
-    phi = lambda t, y, args: y[0]
-    mean = lambda phi, terms: ds.expectation(
-        phi, terms, ds.ImplicitMidpoint(), 0, 1, 0.1, y0, key=jr.key(0)
-    )
-    for name, hamiltonians in (
-        ("H0", (H, plain)),
-        ("noise", (plain, H)),
-        ("H", (plain, one)),
+    first = lambda t, y, args: y[0]
+    for name, kind, *functions in (
+        ("H0", TypeError, first, H, _total),
+        ("noise", TypeError, first, _total, H),
+        ("H", TypeError, first, _total, one),
+        ("phi", AttributeError, lambda t, y, args: args.k, _total, _total),
     ):
-        terms = ds.hamiltonian_terms(*hamiltonians, weak_path(1))
-        asked(name, TypeError, lambda: _solve(terms, y0))
-        asked(name, TypeError, lambda: ds.suggest_solver(terms, 0, y0, want="strong"))
-        asked(name, TypeError, lambda: mean(phi, terms))
-    terms = ds.hamiltonian_terms(plain, plain, weak_path(1))
-    asked("phi", AttributeError, lambda: mean(lambda t, y, args: args.k, terms))
-
-
-def _position(t, y, args):
-    return y[1]
+        for call in calls(*functions):
+            with pytest.raises(kind) as info:
+                call()
+            notes = [note for note in info.value.__notes__ if "left out" in note]
+            assert notes == [f"`{name}` was called with `args=None`. Was it left out?"]
+            assert "'NoneType' obj" in str(info.value)
 
 
 def _force(t, p, q, args):
@@ -303,7 +264,7 @@ GIVEN = dict(t0=0, t1=1, y0=(0.0, 1.0), key=jr.key(0))
 OF_ONE = GIVEN | dict(terms=TERMS, solver=ds.StormerVerlet(), dt0=0.5)
 
 
-def _mean(phi=_position, **others):
+def _mean(phi=lambda t, y, args: y[1], **others):
     few = dict(sampling=ds.IndependentPaths(16))
     return ds.expectation(phi, **(OF_ONE | few | others))
 
@@ -326,119 +287,89 @@ class _Parameters:
     stiffness: float = 1.0
 
 
-def _generator():
-    yield 1.0
-
-
 DEVICE = jax.devices()[0]
 TWO_KEYS = jr.split(jr.key(0), 2)
 OLD_KEYS = jr.split(jr.PRNGKey(0), 2)
 HUGE = 10**12
+PATHS = ds.IndependentPaths(64, HUGE), ds.ValueFunctions(1, 64, HUGE)
+LONG = dict(num_paths=10**9, ts=np.linspace(0.5, 5000, 10_000), t1=5000)
+
+
+def _each(fn, **values):
+    """Calls with each of these values of an argument."""
+    pairs = [{name: x} for name, xs in values.items() for x in xs]
+    return [ft.partial(fn, **pair) for pair in pairs]
+
+
 # From a message to calls that are answered by it. None of them compiles a program.
 REFUSED = {
-    "`confidence` must be a number between 0 and 1, such as 0.95": [
-        lambda: _drawn().interval(95),
-        lambda: _drawn().interval(0),
-        lambda: _drawn().interval(float("nan")),
-        lambda: _drawn().interval("0.95"),  # pyright: ignore
-        lambda: _drawn().interval(None),  # pyright: ignore
-        lambda: _drawn().interval(np.array([0.5, 0.9])),  # pyright: ignore
-    ],
-    "`tol` must be a positive number": [
-        lambda: _mean(tol=True),
-        lambda: _mean(tol=1e-320),
-        lambda: _drawn(tol=jnp.ones(2)),
-    ],
+    "`confidence` must be a number between 0 and 1, such as 0.95": _each(
+        lambda confidence: _drawn().interval(confidence),
+        confidence=[95, float("nan"), "0.95", np.array([0.5, 0.9])],
+    ),
+    "`tol` must be a positive number": _each(_mean, tol=[True, 1e-320, ONES]),
     "`devices` must be a list of one or more devices": [
-        lambda: _drawn(devices=[]),
-        lambda: _mean(devices="cpu"),
-        lambda: _mean(devices=DEVICE),
+        *_each(_mean, devices=["cpu", DEVICE]),
+        *_each(_drawn, devices=[[]]),
     ],
-    "`devices` must differ": [lambda: _drawn(devices=[DEVICE, DEVICE])],
+    "`devices` must differ": _each(_drawn, devices=[[DEVICE, DEVICE]]),
     "`(expectation|ensemble|monte_carlo|compare_solvers)` needs one random key": [
         call
-        for keys in (TWO_KEYS, OLD_KEYS)
-        for call in (
-            lambda: _mean(key=keys),
-            lambda: _paths(key=keys),
-            lambda: _drawn(key=keys),
-            lambda: _compared(key=keys),
-        )
+        for fn in (_mean, _paths, _drawn, _compared)
+        for call in _each(fn, key=[TWO_KEYS, OLD_KEYS])
     ],
-    "`expectation` needs a random key": [lambda: _mean(key=3)],
-    "`compare_solvers` needs a random key": [
-        lambda: _compared(key=0),
-        lambda: _compared(key=None),
-    ],
+    "`expectation` needs a random key": _each(_mean, key=[3]),
+    "`ensemble` needs a random key": _each(_paths, key=[3]),
+    "`compare_solvers` needs a random key": _each(_compared, key=[None]),
     "`first` must be an integer from 0 to": [
-        lambda: _drawn(first=2**64),
-        lambda: _mean(first=2**63),
+        *_each(_drawn, first=[2**64]),
+        *_each(_mean, first=[2**63]),
     ],
-    "Samples have numbers below 2": [
-        lambda: _drawn(first=2**63 - 8),
-        lambda: _drawn(num_paths=2**70),
-    ],
-    "`levels` must be an integer from 1 to": [
-        lambda: _mean(levels=2000),
-        lambda: _mean(levels=0),
-        lambda: _drawn(levels=2000, order=1),
-    ],
+    "Samples have numbers below 2": _each(_drawn, first=[2**63 - 8], num_paths=[2**70]),
+    "`levels` must be an integer from 1 to": _each(_mean, levels=[2000, 0]),
     "paths take .* GB or more, of .* GB. Pass a smaller `batch_size`": [
-        lambda: _mean(sampling=ds.IndependentPaths(64, HUGE)),
-        lambda: _mean(sampling=ds.ValueFunctions(1, 64, HUGE)),
+        *_each(_mean, sampling=PATHS),
         lambda: _drawn(num_paths=HUGE, batch_size=HUGE),
     ],
     "paths take .* GB or more, of .* GB. Pass a smaller `num_paths`": [
-        lambda: _mean(sampling=ds.ArrayRQMC(2**40)),
-        lambda: _paths(num_paths=HUGE),
-        lambda: _paths(num_paths=10**9, ts=np.linspace(0.5, 5000, 10_000), t1=5000),
-        lambda: _compared(num_paths=HUGE),
+        *_each(_mean, sampling=[ds.ArrayRQMC(2**40)]),
+        *_each(_paths, num_paths=[HUGE]),
+        lambda: _paths(**LONG),
+        *_each(_compared, num_paths=[HUGE]),
     ],
-    "`num_paths` must be an integer, 2 or larger": [
-        lambda: _compared(num_paths=0),
-        lambda: _compared(num_paths=1.5),
-        lambda: _compared(num_paths="many"),
-    ],
+    "`num_paths` must be an integer, 2 or larger": _each(
+        _compared, num_paths=[0, "many"]
+    ),
     "must return arrays with one entry or more": [
-        lambda: _mean(lambda t, y, args: jnp.zeros(0)),
         lambda: _mean(lambda t, y, args: {"one": y[1], "none": jnp.zeros((2, 0))}),
         lambda: _drawn(lambda key: jr.normal(key, (0,))),
     ],
     "`terms` must be Diffrax terms.*several in a `diffrax.MultiTerm.*got": [
         call
-        for terms in ([TERMS], (TERMS,), {"a": TERMS}, TERMS.terms, None)
-        for call in (
-            lambda terms=terms: _mean(terms=terms),
-            lambda terms=terms: _paths(terms=terms),
-        )
+        for fn in (_mean, _paths)
+        for call in _each(fn, terms=[[TERMS], (TERMS,), {"a": TERMS}, None])
     ],
     "`solver` must take fixed steps and be for equations with noise": [
-        lambda: _mean(solver=diffrax.Tsit5()),
-        lambda: _paths(solver=diffrax.Kvaerno3()),
-        lambda: _mean(solver=diffrax.HalfSolver(ds.StormerVerlet())),
+        *_each(_mean, solver=[diffrax.Tsit5(), diffrax.HalfSolver(ds.StormerVerlet())]),
+        *_each(_paths, solver=[diffrax.Kvaerno3()]),
     ],
-    "`solvers` must be a list of one or more solvers": [
-        lambda: _compared(solvers=[]),
-        lambda: _compared(solvers=ds.StormerVerlet()),
-        lambda: _compared(solvers="StormerVerlet"),
-    ],
+    "`solvers` must be a list of one or more solvers": _each(
+        _compared, solvers=[[], ds.StormerVerlet()]
+    ),
     "`y0` must hold numbers and arrays of numbers.*got a": [
         call
-        for y0 in ("rest", ("a", "b"), {0.0, 1.0}, _Parameters(), _generator())
-        for call in (
-            lambda y0=y0: _mean(y0=y0),
-            lambda y0=y0: _paths(y0=lambda key: y0),
-            lambda y0=y0: _compared(y0=y0),
-            lambda y0=y0: ds.suggest_solver(TERMS, 0.0, y0, want="weak"),
+        for fn in (
+            _mean,
+            lambda y0: _paths(y0=lambda key: y0),
+            _compared,
+            lambda y0: ds.suggest_solver(TERMS, 0.0, y0, want="weak"),
         )
+        for call in _each(fn, y0=["rest", ("a", "b"), {0.0, 1.0}, _Parameters()])
     ],
     "`args` must hold arrays.*got a": [
         call
-        for args in ({1.0}, (1.0, {2}), _Parameters(), _generator(), np.array(["a"]))
-        for call in (
-            lambda args=args: _mean(args=args),
-            lambda args=args: _paths(args=lambda key: args),
-        )
+        for fn in (_mean, lambda args: _paths(args=lambda key: args))
+        for call in _each(fn, args=[(1.0, {2}), _Parameters(), np.array(["a"])])
     ],
 }
 CALLS = [(message, call) for message, calls in REFUSED.items() for call in calls]

@@ -74,11 +74,8 @@ def test_code_of_a_page_runs_from_top_to_bottom(
         exec(compile(code, f"{page}, block {number}", "exec"), namespace)
 
 
-def test_the_first_program_of_every_page_has_64_bits():
+def test_every_page_starts_with_64_bits_and_takes_no_path_that_repeats_its_noise():
     assert all("jax_enable_x64" in blocks[0] for blocks in PAGES.values())
-
-
-def test_no_code_takes_a_path_that_repeats_its_noise():
     shown = [*PAGES.values(), *DOCSTRINGS.values()]
     assert not any("UnsafeBrownianPath" in code for blocks in shown for code in blocks)
     faq = (ROOT / "docs" / "faq.md").read_text()
@@ -132,17 +129,6 @@ def test_pages_of_evidence_have_the_text_of_the_programs_that_write_them():
         for module in re.findall("<!-- made by (.*) -->", page.read_text()):
             source = ROOT / f"{module.replace('.', '/')}.py"
             assert f'write("{module}"' in source.read_text()
-
-
-def test_docs_list_every_solver():
-    page = (ROOT / "docs/solvers/index.md").read_text()
-    folder = ROOT / "docs/solvers"
-    families = "".join(p.read_text() for p in folder.glob("[!i]*.md"))
-    for name, value in vars(ds).items():
-        if isinstance(value, type) and issubclass(value, diffrax.AbstractSolver):
-            if not name.startswith("Abstract"):
-                assert f"| [`{name}`](" in page, name
-                assert f"::: diffrax_symplectic.{name}\n" in families
 
 
 def test_every_class_of_solvers_is_public_and_in_the_tables():

@@ -16,29 +16,17 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 RESULTS = (ds.Comparison, ds.Ensemble, ds.Expectation, ds.Suggestion, ds.Suggestions)
 # What messages quote besides: the first argument of the user's `flow`, fields of an
 # `Expectation`, an argument that JAX names, the function of Diffrax, libraries, packages.
-OTHERS = {
-    "time",
-    "error",
-    "std_error",
-    "compiler_options",
-    "diffeqsolve",
-    "llvm",
-    "libllvm",
-    "diffrax_symplectic",
+OTHERS = set(
+    "time error std_error compiler_options diffeqsolve llvm libllvm diffrax_symplectic "
     # Of damaged files: no user sees their names.
-    *("begin", "end", "num_good", "num_failed", "failed_on"),
-    *("paths_per_sample", "rounding_floor"),
-}
+    "begin end num_good num_failed failed_on paths_per_sample rounding_floor".split()
+)
 # Functions of the package that take the name of one of the user's arguments, as their first
 # argument or as `name`.
-CHECKS = {
-    "call_user_function",
-    "check_real",
-    "check_takes",
-    "checked_energy",
-    "checked_not_negative",
-    "whole_number",
-}
+CHECKS = set(
+    "call_user_function check_real check_takes checked_energy checked_not_negative "
+    "whole_number".split()
+)
 # In backticks: an argument with its value, a function of the user's, and a name alone.
 WITH_VALUE = re.compile(r"(?<![\w.])([a-z]\w*)=(?!=)")
 OF_THE_USER = re.compile(r"(?<![\w.])([a-zH]\w*)\([\w, ]*\bargs\)")

@@ -1,8 +1,6 @@
 """Second moments on linear models, exactly: one step, and whole solves."""
 
-import functools
 from collections.abc import Callable
-from typing import ClassVar
 
 import diffrax
 import jax
@@ -12,7 +10,6 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
-from diffrax_symplectic._tableau import make_plan
 
 from .families import slow_except
 from .picard import by_picard
@@ -24,37 +21,25 @@ from .problems import kubo_terms
 EXCESS = [
     (ds.ImplicitMidpoint(), -0.00198020),
     (ds.SRKs1(a=0.25), -0.00099626),
-    (ds.SRKs1(a=0.4), None),
     (ds.SRKs2(), -0.00198020),
     (ds.SRKs3(), 0.0),
     (ds.SRKs4(), None),
     (ds.SRKs4(sign=1), None),
     (ds.SRKw1(b=0.5), -0.00198020),
     (ds.SRKw1(b=0.0), 0.0),
-    (ds.SRKw1(b=0.2), None),
-    (ds.SRKw1(b=1.0), 0.0),
     (ds.SRKw2(), None),
     (ds.StrangGauss(), None),
     (ds.SRKw3("a"), -0.00198020),
-    *[(ds.SRKw3(v), 0.0) for v in "bcef"],
+    (ds.SRKw3("b"), 0.0),
     (ds.SRKw4(a21=0.0), 0.0),
     (ds.SRKw5(), 0.0),
 ]
 Y0 = (jnp.array(0.7), jnp.array(-0.4))
+PATH = ds.WeakBrownianPath((), jr.key(0))
 
 
-def _path(solver):
-    if isinstance(solver, ds.SRKs4):
-        levy_area = diffrax.SpaceTimeLevyArea
-        return diffrax.UnsafeBrownianPath((), jr.key(0), levy_area)
-    if type(solver).__module__.startswith("diffrax."):
-        return diffrax.UnsafeBrownianPath((), jr.key(0))
-    return ds.WeakBrownianPath((), jr.key(0), second=isinstance(solver, ds.SRKw5))
-
-
-def _oscillator(solver):
-    energy = lambda t, p, q, args: (p**2 + q**2) / 2
-    return ds.hamiltonian_terms(energy, lambda t, p, q, args: -q, _path(solver))
+def _push(t, p, q, args):
+    return -q
 
 
 def _linear_step(tableau, h):
@@ -84,15 +69,14 @@ def _linear_step(tableau, h):
     return R, r
 
 
-def _moment_map_of(terms, solver, h):
+def moment_map(terms, solver, h):
     return np.asarray(
         jax.jit(lambda: ds.second_moment_map(terms, solver, 0.0, h, Y0))()
     )
 
 
-@functools.cache
-def _moment_map(solver, h):
-    return _moment_map_of(_oscillator(solver), solver, h)
+def oscillator(path):
+    return ds.hamiltonian_terms(lambda t, p, q, args: (p**2 + q**2) / 2, _push, path)
 
 
 def _by_tableau(solver, h):
@@ -119,49 +103,41 @@ def test_moments_grow_by_the_exact_excess_of_each_of_25_000_steps(solver, excess
         assert abs(error) < 0.01
 
 
-def _program(solver):
-    """What is compiled for the solver, up to the numbers in it."""
-    plan = make_plan(solver.tableau.flatten())
-    stages = [(x.channels, x.reads, x.writes) for x in plan.tableau.stages]
-    used = plan.tableau.matrix != 0, plan.tableau.weights != 0
-    return str((stages, plan.blocks, [x.tolist() for x in used]))
+# One for each random variable, and one without noise stages of their own.
+SOLVED = ds.SRKw1(), ds.SRKw2(), ds.SRKs4(), ds.SRKw5()
 
 
-PROGRAMS = {_program(solver): solver for solver, _ in EXCESS}.values()
-
-
-@pytest.mark.parametrize("solver", slow_except([ds.SRKw1()], PROGRAMS), ids=repr)
+@pytest.mark.parametrize("solver", slow_except(SOLVED[:1], SOLVED), ids=repr)
 def test_moments_of_a_whole_solve_are_those_of_the_tableau(solver):
     h, steps = 0.2, 25_000
     _, total = _by_tableau(solver, h)
+    K = moment_map(oscillator(solver.path((), jr.key(0))), by_picard(solver), h)
     z0 = np.array([1.0, *map(float, Y0)])
     for n, rtol in ((1, 1e-12), (steps, 1e-9)):
-        K = np.linalg.matrix_power(_moment_map(solver, h), n)
-        moments = K @ np.kron(z0, z0)
+        moments = np.linalg.matrix_power(K, n) @ np.kron(z0, z0)
         exact = Y0[0] ** 2 + Y0[1] ** 2 + n * h * total
         np.testing.assert_allclose(moments[4] + moments[8], exact, rtol=rtol)
 
 
-@pytest.mark.parametrize(
-    "solver, determinant",
-    [(diffrax.Euler(), lambda h: 1 + h**2), (diffrax.Heun(), lambda h: 1 + h**4 / 4)],
-    ids=["Euler", "Heun"],
-)
-def test_explicit_methods_explode(solver, determinant):
+def test_explicit_methods_explode():
     h = 0.2
-    K = _moment_map(solver, h)
-    growth = np.max(np.abs(np.linalg.eigvals(K)))
+    terms = oscillator(diffrax.UnsafeBrownianPath((), jr.key(0)))
     # The mean square of a rotation with this determinant.
-    np.testing.assert_allclose(growth, determinant(h), rtol=1e-12)
-    # Over 25,000 steps.
-    assert growth**25_000 > 2e4
+    for solver, square in (
+        (diffrax.Euler(), 1 + h**2),
+        (diffrax.Heun(), 1 + h**4 / 4),
+    ):
+        growth = np.max(np.abs(np.linalg.eigvals(moment_map(terms, solver, h))))
+        np.testing.assert_allclose(growth, square, rtol=1e-12)
+        # Over 25,000 steps.
+        assert 25_000 * np.log(growth) > np.log(2e4)
 
 
 def test_moments_of_a_multiplicative_noise_agree_with_the_closed_form():
     # A midpoint step of the Kubo oscillator turns the plane by 2 atan((h + s I) / 2).
     h, s = 0.1, 0.7
-    terms = kubo_terms(ds.WeakBrownianPath((), jr.key(0)), s)
-    K = _moment_map_of(terms, by_picard(ds.ImplicitMidpoint()), h)
+    terms = kubo_terms(PATH, s)
+    K = moment_map(terms, by_picard(ds.ImplicitMidpoint()), h)
     increments = np.sqrt(3 * h) * np.array([-1, 0, 1])
     twice = 4 * np.arctan((h + s * increments) / 2)
     z0 = np.array([1.0, *Y0])
@@ -189,18 +165,6 @@ def test_quadrature_over_gaussian_increments_is_exact_for_polynomials():
     assert abs(two - exact) > 1e-4
 
 
-def test_the_local_error_counts_the_control_of_the_drift():
-    # Heun's method for dy = y d(2 t), without noise: (1 + 2 h + 2 h^2) y.
-    path = ds.WeakBrownianPath((), jr.key(0))
-    still = diffrax.ControlTerm(lambda t, y, args: 0 * y, path)
-    drift = diffrax.ControlTerm(lambda t, y, args: y, _Twice())
-    defect = ds.weak_order_defect(
-        diffrax.MultiTerm(drift, still), diffrax.Heun(), 0.0, 0.125, jnp.ones(()),
-        fn=lambda t, y, args: y, order=1,
-    )  # fmt: skip
-    np.testing.assert_allclose(defect, 2 * 0.125**2, rtol=1e-14)
-
-
 class _Twice(diffrax.AbstractPath):
     t0, t1 = 0.0, jnp.inf
 
@@ -208,32 +172,30 @@ class _Twice(diffrax.AbstractPath):
         return 2 * t0 if t1 is None else 2 * (t1 - t0)
 
 
+def test_the_local_error_counts_the_control_of_the_drift():
+    # Heun's method for dy = y d(2 t), without noise: (1 + 2 h + 2 h^2) y.
+    still = diffrax.ControlTerm(lambda t, y, args: 0 * y, PATH)
+    drift = diffrax.ControlTerm(lambda t, y, args: y, _Twice())
+    terms, one = diffrax.MultiTerm(drift, still), jnp.ones(())
+    step = terms, diffrax.Heun(), 0.0, 0.125, one
+    fn = lambda t, y, args: y
+    defect = jax.jit(lambda: ds.weak_order_defect(*step, fn=fn, order=1))()
+    np.testing.assert_allclose(defect, 2 * 0.125**2, rtol=1e-14)
+
+
 def test_a_failed_step_has_no_expectation_and_says_why():
-    path = ds.WeakBrownianPath((), jr.key(0))
     H0 = lambda t, p, q, args: p**2 / 2 + args * q
-    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: q, path)
-    mean = lambda force: ds.step_expectation(
-        terms, ds.StormerVerlet(), 0.0, 0.1, Y0, force, fn=lambda t, y, args: y[0]
-    )
+    given = ds.hamiltonian_terms(H0, _push, PATH), ds.StormerVerlet(), 0.0, 0.1, Y0
+    mean = jax.jit(lambda x: ds.step_expectation(*given, x, fn=lambda t, y, args: y[0]))
     with pytest.raises(RuntimeError, match="Nonfinite"):
         mean(jnp.nan)
 
 
-class _NoiseInTwoPlaces(ds.AbstractSymplecticSolver):
+class _NoiseInTwoPlaces(diffrax.EulerHeun):
     """Only noise, as the sum of two parts of it."""
 
     parts: Callable
-    structure: ClassVar[str] = "separable"
-    variables: ClassVar[tuple[str, ...]] = ("W", "H")
-
-    def stage_vectors(self, num_noises):
-        return ()
-
-    def order(self, terms):
-        return 1
-
-    def init(self, terms, t0, t1, y0, args):
-        return None
+    minimal_levy_area = diffrax.AbstractSpaceTimeLevyArea
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         y1 = self.parts(terms.terms[1], t0, t1)
@@ -251,8 +213,7 @@ def test_noise_in_two_places_of_a_step_comes_from_one_draw():
         difference = jnp.sqrt(3) * drawn.H
         return drawn.W / 2 + difference, drawn.W / 2 - difference
 
-    h = 0.25
-    area = diffrax.SpaceTimeLevyArea
+    h, area = 0.25, diffrax.SpaceTimeLevyArea
     path = ds.FixedStepBrownianPath((), jr.key(0), levy_area=area)
     terms = ds.hamiltonian_terms(lambda t, p, q, args: p**2 / 2, _push, path)
 
@@ -261,10 +222,7 @@ def test_noise_in_two_places_of_a_step_comes_from_one_draw():
         solver = _NoiseInTwoPlaces(parts)
         return ds.step_expectation(terms, solver, 0.0, h, Y0, fn=products)
 
-    np.testing.assert_allclose(squares(drawn_once), [h / 2, 0, h / 2], atol=1e-14)
+    once, twice = jax.jit(lambda: (squares(drawn_once), squares(drawn_twice)))()
+    np.testing.assert_allclose(once, [h / 2, 0, h / 2], atol=1e-14)
     # The same increment, that of the whole step, in both places.
-    np.testing.assert_allclose(squares(drawn_twice), [h, h, h], atol=1e-14)
-
-
-def _push(t, p, q, args):
-    return -q
+    np.testing.assert_allclose(twice, [h, h, h], atol=1e-14)

@@ -29,14 +29,7 @@ FLAGS = (
 
 
 def _missing() -> str:
-    packages = (
-        "mkdocs",
-        "material",
-        "mkdocstrings",
-        "math_core",
-        "ziamath",
-        "selenium",
-    )
+    packages = "mkdocs material mkdocstrings math_core ziamath selenium".split()
     missing = [p for p in packages if importlib.util.find_spec(p) is None]
     programs = [shutil.which("chromium"), shutil.which(CHROMEDRIVER)]
     return ", ".join(missing + ["Chromium and its driver"] * (None in programs))

@@ -22,121 +22,94 @@ pytestmark = needs_drjit
 # Of GPUs, products of matrices in single precision are less precise by default.
 exact = lambda: jax.default_matmul_precision("highest")
 
-N, STEPS_TAKEN, H, TIMES = 12, 8, 1 / 16, [0.25, 0.5]
+N, H = 12, 1 / 16
 # Of one step they differ by a few roundings, and eight steps of these systems, which are
 # stiff by nothing, carry them on: so many units in the last place of the largest number.
 ULPS = 64
 
 
-def follow(terms, solver, y0, args, engine="drjit", **kwargs) -> ds.Ensemble:
-    kwargs = dict(key=jr.key(5), num_paths=N, ts=TIMES) | kwargs
-    t1 = STEPS_TAKEN * H
-    return ds.ensemble(terms, solver, 0.0, t1, H, y0, args, engine=engine, **kwargs)
+def flat(paths) -> np.ndarray:
+    one = lambda i: jfu.ravel_pytree(jax.tree.map(lambda x: x[i], paths.ys))[0]
+    return np.stack([one(i) for i in range(N)])
 
 
-def assert_same(ys, others, dtype):
-    one = lambda ys, i: jfu.ravel_pytree(jax.tree.map(lambda x: x[i], ys))[0]
-    flat = lambda ys: np.stack([one(ys, i) for i in range(N)])
-    a, b = flat(ys), flat(others)
-    assert a.dtype == b.dtype == dtype
-    assert np.all(np.isfinite(b))
-    size = np.max(np.abs(b), axis=1, keepdims=True)
-    assert np.max(np.abs(a - b) / size) <= ULPS * np.finfo(dtype).eps
-
-
-def assert_same_paths(terms, solver, y0, args, dtype, reference=None):
-    with exact():
-        paths = follow(terms, solver, y0, args)
-        others = follow(terms, reference or solver, y0, args, engine="jax")
-    assert paths.num_failed == others.num_failed == 0
-    # Otherwise those of JAX would be looked at.
-    assert paths.num_stragglers == 0
-    assert_same(paths.ys, others.ys, dtype)
-
-
-def quick(solver, dtype=jnp.float64):
-    """The same solver, with a root finder that is compiled sooner; on other devices it
-    does not come to rounding error."""
+def assert_same_paths(terms, solver, structure="any", dtype=jnp.float64):
+    y0, args = SYSTEMS[structure].draw(jr.key(3), 2, 2, dtype)
+    # With a root finder that is compiled sooner; on other devices it does not come to
+    # rounding error.
+    simple = repr(solver) not in CORE and jax.default_backend() == "cpu"
     atol = 1e-15 if dtype == jnp.float64 else 1e-6
-    return by_picard(solver, atol) if jax.default_backend() == "cpu" else solver
+    reference = by_picard(solver, atol) if simple else solver
+    given = 0.0, 8 * H, H, y0, args
+    options = dict(key=jr.key(5), num_paths=N, ts=[4 * H, 8 * H])
+    with exact():
+        fused = ds.ensemble(terms, solver, *given, **options, engine="drjit")
+        plain = ds.ensemble(terms, reference, *given, **options, engine="jax")
+    assert fused.num_failed == plain.num_failed == 0
+    # Otherwise those of JAX would be looked at.
+    assert fused.num_stragglers == 0
+    found, expected = flat(fused), flat(plain)
+    assert found.dtype == expected.dtype == dtype
+    assert np.all(np.isfinite(expected))
+    size = np.max(np.abs(expected), axis=1, keepdims=True)
+    assert np.max(np.abs(found - expected) / size) <= ULPS * np.finfo(dtype).eps
 
 
-def problem(structure: str, dtype, m: int = 2):
-    return SYSTEMS[structure].draw(jr.key(3), 2, m, dtype)
-
-
-# Without equations, and with friction; those below solve equations.
-QUICK = CORE[2], "BAOAB()"
-
-
-@each(marked(STEPS, QUICK))
+# One with friction; another in single precision.
+@each(marked(STEPS, ["BAOAB()"]))
 def test_of_every_solver(solver):
-    _assert_of_solver(solver, jnp.float64)
+    terms = terms_for(solver, solver.path((2,), jr.key(0)))
+    assert_same_paths(terms, solver, solver.structure)
 
 
 @each(marked([ds.ImplicitMidpoint(), ds.StormerVerlet()], CORE[2:3]))
 def test_of_solvers_in_single_precision(solver):
-    _assert_of_solver(solver, jnp.float32)
-
-
-def _assert_of_solver(solver, dtype):
-    y0, args = problem(solver.structure, dtype)
-    path = solver.path(jax.ShapeDtypeStruct((2,), dtype), jr.key(0))
-    terms = terms_for(solver, path)
-    reference = solver if repr(solver) in CORE else quick(solver, dtype)
-    assert_same_paths(terms, solver, y0, args, dtype, reference)
-
-
-PATHS = {
-    "weak": lambda key: ds.WeakBrownianPath((2,), key),
-    "weak, order 3": lambda key: ds.WeakBrownianPath(
-        (2,), key, order=3, two_point=True
-    ),
-    "Gaussian": lambda key: ds.FixedStepBrownianPath((2,), key),
-    "Gaussian of cells": lambda key: ds.FixedStepBrownianPath((2,), key, cell=H / 4),
-    "truncated": lambda key: ds.TruncatedBrownianPath(
-        ds.FixedStepBrownianPath((2,), key)
-    ),
-    "tree": lambda key: diffrax.VirtualBrownianTree(0.0, 1.0, H / 2, (2,), key),
-    "truncated tree": lambda key: ds.TruncatedBrownianPath(
-        diffrax.VirtualBrownianTree(0.0, 1.0, H / 2, (2,), key)
-    ),
-    "unsafe": lambda key: diffrax.UnsafeBrownianPath((2,), key),
-    "old key": lambda key: ds.FixedStepBrownianPath((2,), jr.key_data(key)),
-}
-
-
-@pytest.mark.parametrize("name", slow_except(["Gaussian of cells"], PATHS))
-def test_of_every_brownian_path(name):
-    y0, args = problem("any", jnp.float64)
-    terms = SYSTEMS["any"].terms(PATHS[name](jr.key(0)))
-    solver = ds.ImplicitMidpoint()
-    assert_same_paths(terms, solver, y0, args, jnp.float64, quick(solver))
-
-
-AREAS = ds.LevyAreaMidpoint(), diffrax.SlowRK()
-
-
-@pytest.mark.parametrize("cell", slow_except([None], [None, H / 2]))
-@pytest.mark.parametrize("solver", slow_except(AREAS[:1], AREAS), ids=repr)
-def test_of_paths_with_areas(solver, cell):
-    gaussian = lambda cell: ds.FixedStepBrownianPath(
-        (2,), jr.key(0), diffrax.SpaceTimeLevyArea, cell=cell
+    # Of cells, which are drawn together.
+    path = gaussian(
+        jr.key(0), shape=jax.ShapeDtypeStruct((2,), jnp.float32), cell=H / 4
     )
-    path, reference = gaussian(cell), solver
-    if isinstance(solver, ds.LevyAreaMidpoint):
-        path = ds.LevyAreaBrownianPath(gaussian(None), jr.key(0), cell=cell)
-        reference = quick(solver)
-    y0, args = problem("any", jnp.float64)
-    terms = SYSTEMS["any"].terms(path)
-    assert_same_paths(terms, solver, y0, args, jnp.float64, reference)
+    assert_same_paths(terms_for(solver, path), solver, solver.structure, jnp.float32)
 
 
-OF_DIFFRAX = diffrax.Heun(), diffrax.EulerHeun()
+def gaussian(key, levy_area=diffrax.BrownianIncrement, shape=(2,), **options):
+    return ds.FixedStepBrownianPath(shape, key, levy_area, **options)
 
 
-@pytest.mark.parametrize("solver", slow_except(OF_DIFFRAX[:1], OF_DIFFRAX), ids=repr)
-def test_of_solvers_of_diffrax(solver):
-    y0, args = problem("any", jnp.float64)
-    path = ds.FixedStepBrownianPath((2,), jr.key(0))
-    assert_same_paths(SYSTEMS["any"].terms(path), solver, y0, args, jnp.float64)
+def tree(key):
+    return diffrax.VirtualBrownianTree(0.0, 1.0, H / 2, (2,), key)
+
+
+def areas(key, **options):
+    path = gaussian(key, diffrax.SpaceTimeLevyArea)
+    return ds.LevyAreaBrownianPath(path, key, **options)
+
+
+VERLET = ds.StormerVerlet()
+PATHS = {
+    "weak": (VERLET, lambda key: ds.WeakBrownianPath((2,), key)),
+    "weak, order 3": (
+        VERLET,
+        lambda key: ds.WeakBrownianPath((2,), key, order=3, two_point=True),
+    ),
+    "Gaussian, with a solver of Diffrax": (diffrax.Heun(), gaussian),
+    "truncated": (VERLET, lambda key: ds.TruncatedBrownianPath(gaussian(key))),
+    "tree": (VERLET, tree),
+    "truncated tree": (VERLET, lambda key: ds.TruncatedBrownianPath(tree(key))),
+    "unsafe": (VERLET, lambda key: diffrax.UnsafeBrownianPath((2,), key)),
+    "old key": (VERLET, lambda key: gaussian(jr.key_data(key))),
+    "areas": (ds.LevyAreaMidpoint(), areas),
+    "areas of cells": (ds.LevyAreaMidpoint(), lambda key: areas(key, cell=H / 2)),
+    "areas in time of cells": (
+        diffrax.SlowRK(),
+        lambda key: gaussian(key, diffrax.SpaceTimeLevyArea, cell=H / 2),
+    ),
+}
+QUICK = "Gaussian, with a solver of Diffrax", "areas"
+
+
+@pytest.mark.parametrize("name", slow_except(QUICK, PATHS))
+def test_of_every_brownian_path(name):
+    solver, path = PATHS[name]
+    structure = "any" if isinstance(solver, ds.LevyAreaMidpoint) else "separable"
+    terms = SYSTEMS[structure].terms(path(jr.key(0)))
+    assert_same_paths(terms, solver, structure)

@@ -1,5 +1,6 @@
 """Programs of JAX, replayed for many lanes by the entrance of `_stablehlo`."""
 
+import contextlib
 from collections.abc import Callable
 from typing import Any
 
@@ -23,31 +24,42 @@ def text_of(fn: Callable, *structs: jax.ShapeDtypeStruct) -> str:
     return lowered.as_text(debug_info=True)
 
 
-def replayed(fn: Callable, *args: np.ndarray) -> list[np.ndarray]:
-    """What Dr.Jit makes of the program of `fn` for each of the lanes, along the first axis
-    of each argument."""
-    structs = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in args]
-    return replayed_text(text_of(fn, *structs), *args)
+@contextlib.contextmanager
+def recorded_lines():
+    """Programs that are made within say which lines they come from."""
+    limit = jax.config.jax_traceback_in_locations_limit  # pyright: ignore
+    jax.config.update("jax_traceback_in_locations_limit", 10)
+    try:
+        yield
+    finally:
+        jax.config.update("jax_traceback_in_locations_limit", limit)
 
 
-def replayed_lanes(
-    fn: Callable, *args: np.ndarray
-) -> tuple[list[np.ndarray], np.ndarray]:
-    """As `replayed`, and which lanes fail."""
-    structs = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in args]
-    return _replayed_lanes(text_of(fn, *structs), *args)
-
-
-def replayed_text(program: str, *args: np.ndarray) -> list[np.ndarray]:
-    """As `replayed`, of the text of a program."""
-    results, lost = _replayed_lanes(program, *args)
+def replayed(program: Callable | str, *args: np.ndarray) -> list[np.ndarray]:
+    """What Dr.Jit makes of a function, or of the text of a program, for each of the lanes,
+    along the first axis of each argument."""
+    results, lost = replayed_lanes(program, *args)
     assert not np.any(lost)
     return results
 
 
-def _replayed_lanes(
-    program: str, *args: np.ndarray
+def replayed_and_by_jax(functions: dict[str, Callable], *args: np.ndarray):
+    """The name of each of these functions, what is replayed, and what JAX gives: all in one
+    program, since most of the time is compiling."""
+    every = lambda *args: [fn(*args) for fn in functions.values()]
+    exact = map(np.asarray, jax.jit(jax.vmap(every))(*args))
+    for name, x, y in zip(functions, replayed(every, *args), exact, strict=True):
+        assert x.dtype == y.dtype and x.shape == y.shape, name
+        yield name, x, y
+
+
+def replayed_lanes(
+    program: Callable | str, *args: np.ndarray
 ) -> tuple[list[np.ndarray], np.ndarray]:
+    """As `replayed`, and which lanes fail."""
+    if not isinstance(program, str):
+        structs = [jax.ShapeDtypeStruct(x.shape[1:], x.dtype) for x in args]
+        program = text_of(program, *structs)
     replay = Replay(program)
     tensors = [tensor(x, of.kind) for x, of in zip(args, replay.arguments)]
     results, errors = replay(*tensors, constants=replay.constants())
