@@ -184,19 +184,39 @@ def spring(t, p, q, args):
 
 
 STEPS = ds.StormerVerlet(), 0, 1, 0.25, (0 * ONE, ONE)
-STILL = ds.hamiltonian_terms(spring, lambda t, p, q, args: 0.0 * q, ())
 
 
 def mean(sampling):
     position = lambda t, y, args: y[1]
-    given = position, STILL, *STEPS
+    given = position, still(()), *STEPS
     return ds.expectation(*given, key=jr.key(0), levels=1, sampling=sampling).mean
+
+
+def still(path):
+    return ds.hamiltonian_terms(spring, lambda t, p, q, args: 0.0 * q, path)
+
+
+def of_key(key):
+    return diffrax.diffeqsolve(still(ds.WeakBrownianPath((), key)), *STEPS).ys[1][-1]
+
+
+def step_by_step():
+    terms = still(ds.WeakBrownianPath((), jr.key(0)))
+    y = STEPS[-1]
+    for t in range(4):
+        times = t / 4, (t + 1) / 4
+        y = ds.step_expectation(terms, STEPS[0], *times, y, fn=lambda t, y, args: y)
+    return y[1]
 
 
 CALLS = {
     "IndependentPaths": lambda: mean(ds.IndependentPaths(2)),
     "ArrayRQMC": lambda: mean(ds.ArrayRQMC(4, 2, sort_by=lambda y: k * y[1])),
-    "ensemble": lambda: ds.ensemble(STILL, *STEPS, key=jr.key(0), num_paths=2).ys[1][0],
+    "ensemble": lambda: ds.ensemble(still(()), *STEPS, key=jr.key(0), num_paths=2).ys[
+        1
+    ][0],
+    "monte_carlo": lambda: ds.monte_carlo(of_key, key=jr.key(0), num_paths=2).mean,
+    "step_expectation": step_by_step,
 }
 
 
