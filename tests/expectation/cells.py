@@ -40,7 +40,7 @@ _KICKS = {
     "multiplicative": lambda t, p, q, s: s * q**2 / 2,
 }
 # Made once, so that JAX compiles programs of them once.
-_TERMS = {name: ds.hamiltonian_terms(_harmonic, H, _PATH) for name, H in _KICKS.items()}
+TERMS = {name: ds.hamiltonian_terms(_harmonic, H, _PATH) for name, H in _KICKS.items()}
 
 
 def _phi(t, y, args):
@@ -62,7 +62,7 @@ def _steps(cell: Cell) -> np.ndarray:
     return np.array(out)
 
 
-def _moment(cell: Cell, power: int) -> np.ndarray:
+def moment(cell: Cell, power: int) -> np.ndarray:
     """The mean of the power of (p, q, 1) by Kronecker's product."""
     mean = sum(w * _kron(M, power) for w, M in zip(_LIKELY, _steps(cell)))
     start = _kron(np.array([0.0, 1.0, 1.0]), power)
@@ -92,7 +92,7 @@ def _exponential_mean(cell: Cell) -> float:
 def exact(cell: Cell, paths: int = 2**15) -> tuple[np.ndarray, np.ndarray]:
     """The means, and their standard errors: that of the indicator is from so many paths of
     each of 32 replicates."""
-    second, fourth = _moment(cell, 2), _moment(cell, 4)
+    second, fourth = moment(cell, 2), moment(cell, 4)
     likely = estimate(cell, ds.ArrayRQMC(paths, 32), 10**6)
     means = [second[4], fourth[0], _exponential_mean(cell), likely.mean[3]]
     return np.array(means), np.array([0, 0, 0, float(likely.std_error[3])])
@@ -101,7 +101,7 @@ def exact(cell: Cell, paths: int = 2**15) -> tuple[np.ndarray, np.ndarray]:
 def arguments(cell: Cell) -> tuple:
     """Of `expectation`, for all four functions."""
     step, s = cell.t1 / cell.steps, jnp.array(cell.strength)
-    return _phi, _TERMS[cell.noise], ds.StormerVerlet(), 0.0, cell.t1, step, Y0, s
+    return _phi, TERMS[cell.noise], ds.StormerVerlet(), 0.0, cell.t1, step, Y0, s
 
 
 def estimate(cell: Cell, sampling: Any, seed: int) -> ds.Expectation:
