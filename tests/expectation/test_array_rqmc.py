@@ -197,6 +197,7 @@ def test_equal_paths_are_one_brownian_motion():
     term = lambda path: diffrax.ControlTerm(lambda t, y, args: y, path)
     terms = diffrax.MultiTerm(term(path), term(other), term(path))
     assert word_layout(terms) == (((0, 4), (4, 8), (0, 4)), 8, False)
+    assert word_layout(NOISE) == (((0, 1),), 1, True)
 
 
 @pytest.mark.parametrize(
