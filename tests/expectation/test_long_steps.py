@@ -10,7 +10,7 @@ import diffrax_symplectic as ds
 from diffrax_symplectic._expectation.long_steps import too_long_steps, unresolved_noise
 from diffrax_symplectic._expectation.out_of_range import is_finite_at_start
 
-from .steps import problem_of
+from .steps import Kicks, problem_of
 
 
 Y0 = jnp.array(0.0), jnp.array(1.0)
@@ -48,36 +48,10 @@ def test_the_limit_of_stability_is_told(size):
     assert "too long for `BAOAB`" in _fault(terms, ds.BAOAB(), 8.0, Y0)
 
 
-class _Kicks(ds.AbstractSymplecticSolver):
-    """A kick and a drift, by a user who knows that there are a drift and a noise."""
-
-    structure = "separable"
-    variables = ("W",)
-    interpolation_cls = diffrax.LocalLinearInterpolation
-
-    def stage_vectors(self, num_noises):
-        return ()
-
-    def order(self, terms):
-        return 1
-
-    def init(self, terms, t0, t1, y0, args):
-        return None
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        drift, noise = terms.terms
-        p, q = y0
-        force, _ = drift.vf(t0, y0, args)
-        kick, _ = noise.vf_prod(t0, y0, args, noise.contr(t0, t1))
-        p = p + (t1 - t0) * force + kick
-        y1 = p, q + (t1 - t0) * p
-        return y1, None, dict(y0=y0, y1=y1), None, diffrax.RESULTS.successful
-
-
 def test_a_solver_of_ones_own_keeps_its_noise():
     y0 = jnp.zeros(1), jnp.ones(1)
-    assert not _is_told(OSCILLATOR, _Kicks(), 1.9, y0)
-    assert _is_told(OSCILLATOR, _Kicks(), 2.1, y0)
+    assert not _is_told(OSCILLATOR, Kicks(), 1.9, y0)
+    assert _is_told(OSCILLATOR, Kicks(), 2.1, y0)
 
 
 def test_steps_that_resolve_a_barrier_or_are_implicit_are_not_told():
