@@ -1,55 +1,60 @@
 """The total error of an estimate contains what remains of the discretization error, and
 what failed paths could change."""
 
+import re
 import warnings
 
 import diffrax
-import jax
 import jax.numpy as jnp
 import jax.random as jr
 import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation.estimate.cautions import cautions
+from diffrax_symplectic._simulation import advice_on_failures
 from diffrax_symplectic._simulation.levels import Combination, level_weights
 
 from ..families import slow_except
+from .steps import problem_of, sampled
 
 
 KEY = jr.key(0)
-# <p q> of an oscillator with friction 0.01 at temperature 1, at t = 500 from (0, 2).
-FAR, EXACT = 500, -0.01106188
+# The number of paths is that of a batch, and numbers are arrays: programs are shared.
+PATHS = 256
 
 
-def _from_means(means: np.ndarray, noise: float = 0.0, num_paths: int = 16):
+def _from_means(means: np.ndarray, noise: float):
     """An estimate, for a method of order 2, whose levels have these means."""
+    means, noise = jnp.asarray(means), jnp.array(noise)
 
     def fn(key, level):
-        both = jnp.asarray(means)[level] + noise * jr.normal(key)
         # Levels that are not coupled.
-        return both + noise * jr.normal(jr.fold_in(key, level))
+        own, common = jr.normal(jr.fold_in(key, level)), jr.normal(key)
+        return means[level] + noise * (common + own)
 
-    return ds.monte_carlo(fn, key=KEY, num_paths=num_paths, levels=len(means), order=2)
+    return ds.monte_carlo(fn, key=KEY, num_paths=PATHS, levels=len(means), order=2)
 
 
-def _far_means(hs) -> list[float]:
-    H0 = lambda t, p, q, args: (p**2 + q**2) / 2
-    terms = ds.langevin_terms(H0, 0.01, 1.0, ds.WeakBrownianPath((), KEY))
-    y0 = jnp.array(0.0), jnp.array(2.0)
-    one = jax.jit(lambda h: ds.second_moment_map(terms, ds.BAOAB(), 0.0, h, y0))
-    z = np.array([1.0, *y0])
-    ends = [
-        np.linalg.matrix_power(np.asarray(one(h)), round(FAR / h)) @ np.kron(z, z)
-        for h in hs
-    ]
-    return [end.reshape(3, 3)[1, 2] for end in ends]
+def _far_mean(h: float) -> float:
+    """<p q> of an oscillator with friction 0.01 at temperature 1, at t = 500 from (0, 2),
+    by steps of `BAOAB`."""
+    kick, drift = np.eye(2), np.eye(2)
+    kick[0, 1], drift[1, 0] = -h / 2, h / 2
+    decay = np.exp(-0.01 * h)
+    M = kick @ drift @ np.diag([decay, 1]) @ drift @ kick
+    force = kick @ drift @ [np.sqrt(1 - decay**2), 0]
+    # The second moments and 1 after a step.
+    step = np.block([[np.kron(M, M), np.kron(force, force)[:, None]], [np.eye(5)[4:]]])
+    return (np.linalg.matrix_power(step, round(500 / h)) @ [0, 0, 0, 4, 1])[1]
 
 
 def test_three_levels_know_that_the_steps_are_too_long_and_two_promise_nothing():
-    means = np.array(_far_means([0.2, 0.1, 0.05]))
+    exact = -0.01106188
+    means = np.array([_far_mean(h) for h in (0.2, 0.1, 0.05)])
     two, three = _from_means(means[:2], 1e-9), _from_means(means, 1e-9)
     # The change by the extrapolation is half of what remains.
-    assert two.error < abs(two.mean - EXACT) / 1.9
+    assert two.error < abs(two.mean - exact) / 1.9
     assert two.off_order is None and "order" not in str(two)
     assert three.off_order and "do not fit the order" in str(three)
     np.testing.assert_allclose(three.error, np.max(np.abs(np.diff(means))), rtol=1e-5)
@@ -57,9 +62,11 @@ def test_three_levels_know_that_the_steps_are_too_long_and_two_promise_nothing()
 
 @pytest.mark.parametrize("size", [1e-12, 1e-4])
 def test_heavy_tails_are_told_only_where_they_matter_beside_the_whole_error(size):
+    factor = jnp.array(size)
+
     def fn(key, level):
         # The mean of each level, and a variable whose mean is made by rare samples.
-        return jnp.array([1.3, 1.0])[level] + size * jnp.exp(5 * jr.normal(key))
+        return jnp.array([1.3, 1.0])[level] + factor * jnp.exp(5 * jr.normal(key))
 
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
@@ -74,7 +81,7 @@ def test_changes_fit_the_order_unless_sampling_shows_that_they_do_not(noise):
     # Half an order less, the order, one with a term of higher order, two orders more, no
     # change at all, one that comes late, and one that turns.
     rows = [h**1.5, h**2, h**2 - 0.1 * h**3, h**4, 0 * h, [0, 0, 1], [0, 1, 0.75]]
-    got = _from_means(np.transpose(rows), noise, 256)
+    got = _from_means(np.transpose(rows), noise)
     off = np.array([True, False, False, False, False, True, True])
     np.testing.assert_array_equal(got.off_order, off & (noise < 1))
     last, before = np.diff(rows)[:, 1], np.diff(rows)[:, 0]
@@ -139,9 +146,8 @@ def test_levels_are_added_until_the_tolerance_holds_for_the_whole_error():
 
 def test_samples_end_where_more_of_them_do_not_reach_the_tolerance():
     def with_levels(*means, noise=1e-6, **kwargs):
-        def fn(key, level):
-            return jnp.asarray(means)[level] + noise * jr.normal(key)
-
+        noise, means = jnp.array(noise), jnp.array(means)
+        fn = lambda key, level: means[level] + noise * jr.normal(key)
         kwargs = dict(key=KEY, num_paths=10**6, batch_size=64, order=2) | kwargs
         return ds.monte_carlo(fn, levels=len(means), **kwargs)
 
@@ -162,36 +168,46 @@ def test_paths_that_fail_with_longer_steps_alone_are_told():
     H0 = lambda t, p, q, args: (p**2 + 18**2 * q**2) / 2
     terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: 0.1 * q, ())
     lost = lambda t, y, args: jnp.where(jnp.abs(y[1]) > 10, jnp.nan, y[1])
-    given = lost, terms, ds.StormerVerlet(), 0, 2, 0.125, START
-    sampling = ds.IndependentPaths(64)
-    said = "do not agree, since 64 paths fail.* and 0 with"
-    with pytest.warns(UserWarning, match=said):
-        none = ds.expectation(*given, key=KEY, sampling=sampling)
+    given = ds.IndependentPaths(64), terms, ds.StormerVerlet(), 0.125, START
+    none = sampled(*given, num_steps=16, phi=lost)
     assert none.failed_on == (64, 0) and none.num_failed == 64
+    said = r"do not agree, since 64 paths fail.* and 0 with"
+    assert re.search(said, " ".join(cautions(none, None, "")))
 
 
-def test_changes_are_compared_after_all_but_one_power_is_eliminated():
-    for order, levels in ((1, 3), (2, 3), (1, 4), (2, 5)):
-        weights = level_weights(order, levels)
-        last, before, miss = weights[Combination.LAST :]
-        h = 0.5 ** np.arange(levels)
-        power = order + levels - 3
-        # Lower powers, with a sign that would turn the changes of the means.
-        means = 1 + h**power - 0.6 * (power > order) * h**order
-        assert last @ means == pytest.approx(2.0**-power * (before @ means), rel=1e-12)
-        assert abs(before @ means) > 1e-3 and abs(miss @ means) < 1e-14
-
-
-def test_the_last_extrapolation_counts_as_one_of_the_first_power():
-    for order, levels in ((1, 2), (2, 2), (1, 3), (2, 4)):
-        weights = level_weights(order, levels)
-        last_power = order + levels - 2
-        factor = (2.0**last_power - 1) / (2.0**order - 1)
-        np.testing.assert_allclose(
-            weights[Combination.BY_FIRST_POWER],
-            factor * weights[Combination.EXTRAPOLATION],
-            atol=1e-13,
-        )
+@pytest.mark.parametrize(
+    "order, levels", [(1, 1), (2, 2), (3, 2), (1, 3), (2, 3), (1, 4), (2, 4)]
+)
+def test_weights_of_levels_cancel_powers_of_the_step_size(order, levels):
+    weights = level_weights(order, levels)
+    h = 0.5 ** np.arange(levels)
+    best = weights[Combination.BEST]
+    np.testing.assert_allclose(best.sum(), 1)
+    for power in range(order, order + levels - 1):
+        assert abs(best @ h**power) < 1e-13
+    if levels == 1:
+        return
+    # The finest level is the best estimate and its bias. What the last power but one
+    # leaves is what the last extrapolation takes away.
+    np.testing.assert_allclose(best + weights[1], np.eye(levels)[-1], atol=1e-13)
+    last_power = order + levels - 2
+    extrapolation = weights[Combination.EXTRAPOLATION]
+    np.testing.assert_allclose(extrapolation.sum(), 0, atol=1e-13)
+    before = best - extrapolation
+    assert before[0] == 0 and abs(before @ h**last_power) > 1e-4
+    # It counts as one of the first power.
+    factor = (2.0**last_power - 1) / (2.0**order - 1)
+    by_first_power = weights[Combination.BY_FIRST_POWER]
+    np.testing.assert_allclose(by_first_power, factor * extrapolation, atol=1e-13)
+    if levels == 2:
+        return
+    # Changes are compared after all but one power is eliminated. Lower powers come with a
+    # sign that would turn the changes of the means.
+    last, before, miss = weights[Combination.LAST :]
+    power = last_power - 1
+    means = 1 + h**power - 0.6 * (power > order) * h**order
+    assert last @ means == pytest.approx(2.0**-power * (before @ means), rel=1e-12)
+    assert abs(before @ means) > 1e-3 and abs(miss @ means) < 1e-14
 
 
 def _uniform_unless(lost: float):
@@ -253,14 +269,14 @@ def test_failed_paths_count_by_the_spread_of_paths_in_every_sampling(sampling):
     assert got.std_error < abs(got.mean) < got.error
 
 
-def test_bounded_increments_are_advised_where_they_are_not():
+def test_advice_on_failures_fits_the_path_and_the_solver():
+    def advice(terms, solver, y0):
+        return advice_on_failures(problem_of(terms, solver, 0.25, y0))
+
     gaussian = ds.FixedStepBrownianPath((), KEY)
     truncated = ds.TruncatedBrownianPath(gaussian)
     for path in (gaussian, ds.WeakBrownianPath((), KEY), truncated):
-        with pytest.warns(UserWarning, match="paths failed") as told:
-            ds.ensemble(
-                _added(path), diffrax.EulerHeun(), 0, 2, 0.25, jnp.zeros(()), key=KEY,
-                num_paths=64,
-            )  # fmt: skip
-        said = any("bounded increments" in str(x.message) for x in told)
-        assert said == (path is gaussian)
+        said = advice(_added(path), diffrax.EulerHeun(), jnp.zeros(()))
+        assert ("bounded increments" in said) == (path is gaussian)
+    said = advice(PENDULUM, ds.ImplicitMidpoint(), START)
+    assert "meet: pass a smaller `dt0`, or an explicit solver" in said
