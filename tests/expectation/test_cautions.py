@@ -77,32 +77,30 @@ def test_the_share_of_the_largest_path_is_told_with_its_place():
     def rare(key):
         return jnp.stack([jr.normal(key), 1.0 * (jr.uniform(key) < 0.005)])
 
-    hits = 400 * ds.monte_carlo(rare, key=KEY, num_paths=400).mean[1]
-    (message,) = _told(lambda: ds.monte_carlo(rare, key=KEY, num_paths=400))
+    with pytest.warns(UserWarning) as told:
+        hits = 400 * ds.monte_carlo(rare, key=KEY, num_paths=400).mean[1]
+    (message,) = [str(x.message) for x in told]
     share, place = re.findall(r"for (\d+)% of the variance \((.*?)\)", message)[0]
     # Each hit has the same deviation.
     assert 1 <= hits < 8 and abs(int(share) - 100 / hits) <= 1
     assert place == "[1]" and message.startswith("One path in 400 accounts")
 
 
-def _by_levels(means, noise):
-    """Levels with these means, and one noise for all of them."""
-
-    def fn(key, level):
-        return jnp.asarray(means)[level] + jnp.asarray(noise) * jr.normal(key)
-
-    return _told(lambda: ds.monte_carlo(fn, key=KEY, num_paths=4096, levels=2, order=2))
-
-
 def test_steps_that_do_not_agree_are_told_with_their_place():
-    (message,) = _by_levels([[1.0, 4.0], [1.0, 1.0]], [0.1, 0.1])
+    def told(means, noise):
+        """Of levels with these means, and one noise for all of them."""
+        means, noise = jnp.array(means), jnp.array(noise)
+        fn = lambda key, level: means[level] + noise * jr.normal(key)
+        few = dict(key=KEY, num_paths=4096)
+        return _told(lambda: ds.monte_carlo(fn, **few, levels=2, order=2))
+
+    (message,) = told([[1.0, 4.0], [1.0, 1.0]], [0.1, 0.1])
     assert "do not agree ([1]): extrapolation" in message
     assert re.search(r"the mean from (0\.99|1)\S* to -?0\.00", message)
-
-
-def test_a_mean_that_is_zero_within_its_spread_is_no_disagreement():
-    assert not _by_levels([0.09, 0.0], 1.0)
-    assert _by_levels([0.09, 0.0], 0.01)
+    # A mean that is zero within its spread is no disagreement.
+    zero = [[0.09, 0.09], [0.0, 0.0]]
+    assert not told(zero, [1.0, 1.0])
+    assert told(zero, [1.0, 0.01])
 
 
 def test_numbers_that_single_precision_loses_are_named():

@@ -68,30 +68,20 @@ def test_an_interrupt_after_the_last_sample_keeps_all(name, monkeypatch):
     _check_interrupted(_mean, 512)
 
 
-def test_an_interrupt_while_the_meter_closes_keeps_all():
+def test_an_interrupt_while_the_meter_closes_or_a_user_is_warned_keeps_all(monkeypatch):
     _check_interrupted(lambda: _mean(progress_meter=_Closing()), 512)
-    draw = lambda meter: ds.monte_carlo(
-        jr.normal, key=jr.key(0), num_paths=16, progress_meter=meter
+    draw = lambda **options: ds.monte_carlo(
+        jr.normal, key=jr.key(0), num_paths=16, **options
     )
-    _check_interrupted(lambda: draw(_Closing()), 16)
-
-
-def test_an_interrupt_while_a_user_is_warned_keeps_all(monkeypatch):
+    _check_interrupted(lambda: draw(progress_meter=_Closing()), 16)
     monkeypatch.setattr(MONTE_CARLO, "cautions", _interrupted)
-    _check_interrupted(
-        lambda: ds.monte_carlo(jr.normal, key=jr.key(0), num_paths=16), 16
-    )
+    _check_interrupted(draw, 16)
 
 
 def test_an_interrupt_between_levels_keeps_the_finished_one(monkeypatch):
     choose = EXPECTATION.choose
-    chosen = []
-
-    def interrupted_at_third_level(*given):
-        if chosen:
-            raise KeyboardInterrupt
-        chosen.append(choose(*given))
-        return chosen[0]
+    calls = iter([choose, _interrupted])
+    interrupted_at_third_level = lambda *given: next(calls)(*given)
 
     whole = _mean(512, levels=2)
     monkeypatch.setattr(EXPECTATION, "choose", interrupted_at_third_level)
