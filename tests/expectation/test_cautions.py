@@ -66,6 +66,7 @@ def test_times_stand_beside_rows_also_from_files_and_merged(tmp_path):
         names = [line.split(":")[0] for line in lines[:4]]
         assert lines[4] == "not included: the discretization error (see `levels`)"
         assert names == [f"t={t}, ['both'][{k}]" for t in ("0.3", "1") for k in (0, 1)]
+        assert f"{estimate.num_paths} paths on 1 level, 0 failed" in lines[-1]
     # A file of an earlier version has no times.
     with np.load(tmp_path / "one.npz") as arrays:
         np.savez(tmp_path / "old.npz", **{k: x for k, x in arrays.items() if k != "ts"})

@@ -2,12 +2,13 @@
 
 import sys
 
-import diffrax
 import jax.numpy as jnp
 import jax.random as jr
 import pytest
 
 import diffrax_symplectic as ds
+
+from ..problems import RecordingMeter
 
 
 # The functions of the same names hide their modules.
@@ -35,17 +36,8 @@ def _interrupted(*args, **kwargs):
     raise KeyboardInterrupt
 
 
-class _Closing(diffrax.AbstractProgressMeter):
-    """Takes so long to close that the user interrupts it."""
-
-    def init(self):
-        return None
-
-    def step(self, state, progress):
-        return None
-
-    def close(self, state):
-        raise KeyboardInterrupt
+# Takes so long to close that the user interrupts it.
+CLOSING = RecordingMeter([], "close", KeyboardInterrupt)
 
 
 def _check_interrupted(call, num_paths):
@@ -69,11 +61,11 @@ def test_an_interrupt_after_the_last_sample_keeps_all(name, monkeypatch):
 
 
 def test_an_interrupt_while_the_meter_closes_or_a_user_is_warned_keeps_all(monkeypatch):
-    _check_interrupted(lambda: _mean(progress_meter=_Closing()), 512)
+    _check_interrupted(lambda: _mean(progress_meter=CLOSING), 512)
     draw = lambda **options: ds.monte_carlo(
         jr.normal, key=jr.key(0), num_paths=16, **options
     )
-    _check_interrupted(lambda: draw(progress_meter=_Closing()), 16)
+    _check_interrupted(lambda: draw(progress_meter=CLOSING), 16)
     monkeypatch.setattr(MONTE_CARLO, "cautions", _interrupted)
     _check_interrupted(draw, 16)
 

@@ -20,6 +20,7 @@ import pytest
 
 import diffrax_symplectic as ds
 
+from ..problems import RecordingMeter
 from .cells import Cell, moment
 from .steps import sampled
 
@@ -75,23 +76,11 @@ def test_single_precision_is_accumulated_in_double():
 
 @pytest.mark.core
 def test_an_interrupt_loses_only_what_is_running_and_the_estimate_can_be_continued():
-    class Interrupting(diffrax.AbstractProgressMeter):
-        def init(self):
-            return 0
-
-        def step(self, state, progress):
-            if state == 2:
-                raise KeyboardInterrupt
-            return state + 1
-
-        def close(self, state):
-            pass
-
     run = lambda num_paths, key=KEY, fn=_normal, **options: ds.monte_carlo(
         fn, key=key, num_paths=num_paths, batch_size=100, **options
     )
     with pytest.raises(ds.ExpectationInterrupted) as info:
-        run(1000, progress_meter=Interrupting())
+        run(1000, progress_meter=RecordingMeter([], 2, KeyboardInterrupt))
     first = info.value.estimate
     assert first.num_paths == 300
     rest = ds.monte_carlo(_normal, key=KEY, num_paths=1000, start=first)
@@ -204,18 +193,6 @@ def test_complex_values_and_functions_that_return_nothing_are_refused():
     for fn, said in ((lambda key: jr.normal(key) * 1j, ""), (lambda key: None, "none")):
         with pytest.raises(ValueError, match=f"`fn` must return real arrays.*{said}"):
             ds.monte_carlo(fn, key=jr.key(0), num_paths=10)
-
-
-def test_an_estimate_prints_every_number_of_the_mean_in_a_line_with_its_place():
-    ones = lambda key: jnp.ones((5, 6)) + 0 * jr.normal(key)
-    got = ds.monte_carlo(
-        lambda key: {"a": ones(key), "b": 2.0}, key=jr.key(0), num_paths=10
-    )
-    lines = str(got).splitlines()
-    assert lines[0] == "['a'][0, 0]: 1.000000000000000 ± 2.2e-16"
-    assert lines[29] == "['a'][4, 5]: 1.000000000000000 ± 2.2e-16"
-    assert lines[30] == "['b']: 2.000000000000000 ± 4.4e-16"
-    assert len(lines) == 33 and "10 paths on 1 level, 0 failed" in lines[-1]
 
 
 def test_old_style_keys_will_do():

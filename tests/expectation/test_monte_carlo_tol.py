@@ -95,6 +95,8 @@ def test_levels_of_a_sample_share_its_key_and_go_on_where_they_stopped():
         f"sampling {got.std_error:.1e}, discretization {got.discretization_error:.1e}"
     )
     assert f"± {got.error:.1e} ({parts})" in str(got)
+    low, high = got.interval(0.5)
+    assert high - low > got.error
     rest = run(1000, start=run(300))
     np.testing.assert_allclose(rest.mean, got.mean, rtol=1e-12)
     np.testing.assert_allclose(rest.bias, got.bias, rtol=1e-11)

@@ -103,13 +103,3 @@ def test_files_keep_what_tells_problems_apart(first, second):
     with pytest.warns(UserWarning, match="without digests of its arguments"):
         old = ds.Expectation.load(file)
     assert old.merge(second).num_paths == 8
-
-
-def test_functions_of_monte_carlo_are_told_apart():
-    average = lambda fn, first: ds.monte_carlo(
-        fn, key=jr.key(0), num_paths=4, first=first
-    )
-    one = average(lambda key: jr.normal(key), 0)
-    assert one.merge(average(lambda key: jr.normal(key), 4)).num_paths == 8
-    with pytest.raises(ValueError, match="another `fn`"):
-        one.merge(average(lambda key: 2 * jr.normal(key), 4))

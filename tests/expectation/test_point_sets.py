@@ -14,14 +14,13 @@ from diffrax_symplectic._expectation.sorted.points import (
     _JOE_AND_KUO,
     _sobol_points_of_scipy,
     balanced_in_sixths,
-    nested_scramble,
     num_seeds,
     scrambled,
     sobol_points,
 )
 
 
-@pytest.mark.parametrize("n", [2, 64, 2**14])
+@pytest.mark.parametrize("n", [2, 2**14])
 def test_direction_numbers_are_those_of_scipy(n):
     for d in (1, len(_JOE_AND_KUO), len(_JOE_AND_KUO) + 1):
         points = _sobol_points_of_scipy(n, d)
@@ -61,17 +60,6 @@ def test_one_three_point_variable_is_balanced_among_any_six():
         assert np.abs(at_place - 1 / 6).max() <= 4.5 * np.sqrt(5 / 36 / 4000)
     # The seeds give different arrangements.
     assert len(np.unique(signs, axis=0)) > 3990
-
-
-def test_scrambling_is_a_bijection_that_respects_intervals():
-    x = np.arange(2**16, dtype=np.uint32) << np.uint32(16)
-    y = np.asarray(nested_scramble(jnp.asarray(x), jnp.uint32(123456789)))
-    for k in (1, 2, 5, 16):
-        shift = np.uint32(32 - k)
-        # Of each interval one image, and of different intervals different ones.
-        pairs = np.unique(np.stack([x >> shift, y >> shift]), axis=1)
-        assert pairs.shape[1] == 2**k
-        assert len(np.unique(pairs[1])) == 2**k
 
 
 @pytest.mark.parametrize("d, bits", [(2, 4), (3, 3), (5, 2)])

@@ -2,12 +2,13 @@
 
 import time
 
-import diffrax
 import jax.random as jr
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation import progress as progress_module
 from diffrax_symplectic._expectation.progress import NO_METER, Progress
+
+from ..problems import RecordingMeter
 
 
 def test_a_long_call_prints_one_line(monkeypatch, capsys):
@@ -34,18 +35,6 @@ def test_short_calls_and_calls_with_a_meter_print_nothing(monkeypatch, capsys):
     with Progress("expectation", NO_METER, ""):
         pass
     monkeypatch.setattr(progress_module, "_SECONDS_OF_SILENCE", 0.01)
-    meter = _SilentMeter()
-    with Progress("expectation", meter, ""):
+    with Progress("expectation", RecordingMeter([]), ""):
         time.sleep(0.1)
     assert capsys.readouterr().err == ""
-
-
-class _SilentMeter(diffrax.AbstractProgressMeter):
-    def init(self):
-        return None
-
-    def step(self, state, progress):
-        return state
-
-    def close(self, state):
-        return None

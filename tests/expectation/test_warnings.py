@@ -7,7 +7,6 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
-import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
@@ -115,18 +114,6 @@ def test_of_a_fit_that_takes_long(monkeypatch):
     monkeypatch.setattr(value_functions, "_MOST_WITHOUT_WARNING", 1)
     call = mean(WEAK, jnp.ones(2), ds.ValueFunctions(2, 64))
     here(call, "The fit of `ValueFunctions` takes as long")
-
-
-@pytest.mark.slow
-def test_of_a_fit_that_is_no_better(monkeypatch):
-    comparison = value_functions._comparison
-
-    def none_is_better(*given):
-        choice, remainder = comparison(*given)
-        return np.zeros_like(choice), remainder
-
-    monkeypatch.setattr(value_functions, "_comparison", none_is_better)
-    here(mean(sampling=ds.ValueFunctions(2, 64)), "is no better than")
 
 
 def test_of_failed_paths():
