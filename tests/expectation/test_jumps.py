@@ -1,4 +1,5 @@
-"""Forces and noise that jump in time are told where two levels do not show their error."""
+"""Forces and noise that jump in time, or change too fast for the steps, are told where two
+levels do not show their error."""
 
 import warnings
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation.fast_drive import unresolved_drive
 from diffrax_symplectic._expectation.jumps import jumps_at_step_ends, jumps_within_steps
 
 from .steps import problem_of
@@ -237,3 +239,71 @@ def test_two_levels_agree_on_a_wrong_mean_unless_the_cure_is_taken(stiffness, is
         got = ds.expectation(*given, key=jr.key(0), sampling=sampling)
     # By the equations of the moments before and after time 1.
     assert (abs(got.mean - 0.7037) < got.error) == is_right
+
+
+WIDTHS = 0.03, 0.01, 1e-3
+
+
+def _tenfold(t):
+    return jnp.cos(2 * jnp.pi * 10 * t)
+
+
+def _pulse(width):
+    return lambda t: jnp.exp(-(((t - 10.06) / width) ** 2) / 2) / width
+
+
+UNRESOLVED = {
+    "its period divides all steps": _tenfold,
+    "beside a slow one": lambda t: jnp.cos(t) + 0.1 * _tenfold(t),
+} | {f"a pulse of {width} between stages": _pulse(width) for width in WIDTHS}
+RESOLVED = {
+    "constant": lambda t: 1.0 + 0 * t,
+    "a third of a period in a step": lambda t: jnp.cos(2 * jnp.pi / 3 * t / 0.2),
+    "a ramp": lambda t: t,
+    "a pulse over many steps": lambda t: jnp.exp(-(((t - 10) / 2) ** 2)),
+    "a quench at a step end": lambda t: jnp.where(t < 10, 0.0, 1.0),
+    "a quench with a mean": lambda t: (
+        jnp.where(t < 10 - 1e-9, 0.0, 0.5) + jnp.where(t < 10 + 1e-9, 0.0, 0.5)
+    ),
+    "a fast ripple that is too small": lambda t: 1 + 1e-6 * _tenfold(t),
+}
+
+
+def _message(terms, args=None, levels=2):
+    """For steps of 0.4, and fractions of it."""
+    solver = ds.BAOAB(ds.ImplicitMidpoint())
+    problem = problem_of(terms, solver, 0.4, REST, args, num_steps=50, levels=levels)
+    return unresolved_drive(problem)
+
+
+def test_only_fast_drives_are_told():
+    """One program for all of them, in which a number selects the force."""
+    forces = UNRESOLVED | RESOLVED
+
+    def energy(t, p, q, number):
+        return (p**2 + q**2) / 2 - jax.lax.switch(number, [*forces.values()], t) * q
+
+    terms = ds.langevin_terms(energy, 0.5, 0.1, ())
+    for number, name in enumerate(forces):
+        told = _message(terms, jnp.array(number)) is not None
+        assert told == (name in UNRESOLVED), name
+
+
+@pytest.mark.parametrize("levels, shortest", [(2, "0.2"), (3, "0.1")])
+def test_noise_that_changes_fast_is_told_with_the_shortest_steps(levels, shortest):
+    energy = lambda t, p, q, args: (p**2 + q**2) / 2
+    noise = lambda t, p, q, args: (1 + _tenfold(t)) * q
+    terms = ds.hamiltonian_terms(energy, noise, ())
+    message = _message(terms, levels=levels)
+    assert f"steps of {shortest}, the shortest" in message
+
+
+def test_flips_at_random_times_are_not_told():
+    def flips(key):
+        return jr.uniform(key, (8,), minval=0.0, maxval=20.0)
+
+    def energy(t, p, q, times):
+        sign = jnp.prod(jnp.where(t < times, 1.0, -1.0))
+        return (p**2 + q**2) / 2 - sign * q
+
+    assert _message(ds.langevin_terms(energy, 0.5, 0.1, ()), flips) is None
