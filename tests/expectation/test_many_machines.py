@@ -1,4 +1,5 @@
-"""An estimate in parts, made anywhere, is that of one run to the last bit."""
+"""An estimate in parts, made anywhere, is that of one run to the last bit, and parts come
+from the same arguments: others are refused by their names."""
 
 import dataclasses
 import os
@@ -15,6 +16,7 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation.sampling import AbstractSampling
+from diffrax_symplectic._simulation import Problem
 
 from ..families import slow_except
 
@@ -27,14 +29,6 @@ SAMPLINGS = {
 }
 
 
-# Made once, so that JAX compiles programs of them once.
-TERMS = ds.hamiltonian_terms(
-    lambda t, p, q, args: (p**2 + q**2) / 2,
-    lambda t, p, q, args: jnp.cos(q),
-    ds.WeakBrownianPath((), jr.key(0)),
-)
-
-
 def _start(key):
     """Each path has its own."""
     return jnp.array(0.0), 1 + jr.normal(key) / 8
@@ -44,10 +38,24 @@ def _phi(t, y, args):
     return {"q2": y[1] ** 2, "both": (y[0], jnp.stack(y))}
 
 
-def _part(name: str, n: int, first: int = 0, **kwargs) -> ds.Expectation:
+def _spring(t, p, q, args):
+    return p**2 / 2 + args * q**2 / 2
+
+
+def _arguments(
+    k=1.0, energy=_spring, solver=None, dt0=0.25, t1=1.0, t0=0.0, y0=_start, phi=_phi,
+    ts=None,
+):  # fmt: skip
+    path = ds.WeakBrownianPath((), jr.key(0))
+    terms = ds.hamiltonian_terms(energy, lambda t, p, q, args: jnp.cos(q), path)
+    solver = solver or ds.StormerVerlet()
+    return phi, terms, solver, t0, t1, dt0, y0, jnp.array(k), ts
+
+
+def _part(name: str, n: int, first: int = 0, k=1.0, **kwargs) -> ds.Expectation:
     return ds.expectation(
-        _phi, TERMS, ds.StormerVerlet(), 0.0, 1.0, 0.25, _start, key=KEY, levels=2,
-        sampling=SAMPLINGS[name](n), first=first, **kwargs,
+        *_arguments(k)[:-1], key=KEY, levels=2, sampling=SAMPLINGS[name](n),
+        first=first, **kwargs,
     )  # fmt: skip
 
 
@@ -105,6 +113,72 @@ def test_parts_that_do_not_fit_are_refused():
         _part(name, 32, -1)
     with pytest.raises(ValueError, match="Pass either `start`.*, or `first`"):
         _part(name, 64, 32, start=one)
+
+
+# From the name of an argument to other ones.
+OTHERS = {
+    "args": dict(k=9.0),
+    "terms": dict(energy=lambda t, p, q, args: p**2 / 2 + args * q**2),
+    "solver": dict(solver=ds.ImplicitMidpoint()),
+    "dt0": dict(dt0=0.125),
+    "t1": dict(t1=2.0),
+    "t0": dict(t0=0.5, t1=1.5),
+    "y0": dict(y0=(jnp.array(1.0), jnp.array(1.0))),
+    "phi": dict(phi=lambda t, y, args: _phi(t, y, args) | {"q2": y[0]}),
+    "ts": dict(ts=[0.5]),
+}
+
+
+@pytest.fixture(scope="module")
+def first():
+    return _part("IndependentPaths", 16)
+
+
+@pytest.fixture(scope="module")
+def second():
+    return _part("IndependentPaths", 16, 16)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_parts_of_another_problem_are_refused_by_its_argument(name, first, second):
+    def with_digests(estimate, **changes):
+        problem = Problem.of(*_arguments(**changes), 2, key=KEY)
+        return dataclasses.replace(estimate, digests=problem.digests)
+
+    # With times the estimate has another shape.
+    same = dict(ts=[1.0]) if name == "ts" else {}
+    one = with_digests(first, **same)
+    # A function that computes the same is the same.
+    again = dict(energy=lambda t, p, q, args: p**2 / 2 + args * q**2 / 2)
+    assert one.merge(with_digests(second, **same, **again)).num_paths == 32
+    with pytest.raises(ValueError, match=f"merge was computed with another `{name}`"):
+        one.merge(with_digests(second, **OTHERS[name]))
+
+
+def test_what_another_problem_computed_is_not_continued(first, second):
+    assert first.merge(second).num_paths == 32
+    with pytest.raises(ValueError, match="`start` was computed with another `args`"):
+        _part("IndependentPaths", 32, k=9.0, start=first)
+
+
+def test_parts_of_other_levels_are_refused(first, second):
+    # Four levels have as many combinations as five.
+    four, five = (
+        dataclasses.replace(one, levels=levels)
+        for one, levels in ((first, 4), (second, 5))
+    )
+    with pytest.raises(ValueError, match="another structure or other shapes"):
+        four.merge(five)
+
+
+def test_files_keep_what_tells_problems_apart(first, second, tmp_path):
+    first.save(tmp_path / "first")
+    assert ds.Expectation.load(tmp_path / "first").digests == first.digests
+    # Those of earlier versions do not have it.
+    dataclasses.replace(first, digests=None).save(tmp_path / "old")
+    with pytest.warns(UserWarning, match="without digests of its arguments"):
+        old = ds.Expectation.load(tmp_path / "old")
+    assert old.merge(second).num_paths == 32
 
 
 class Own(AbstractSampling):
