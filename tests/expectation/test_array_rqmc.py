@@ -2,11 +2,7 @@
 each path has its law, and what is estimated is exact up to the spread that is reported."""
 
 import functools as ft
-import os
-import subprocess
-import sys
 from collections.abc import Callable
-from pathlib import Path
 
 import diffrax
 import equinox as eqx
@@ -56,10 +52,8 @@ def _estimate(solver=VERLET, terms=TERMS, phi=SQUARE, **kwargs):
     kwargs = dict(num_paths=256, replicates=4, sort_by=None, levels=1) | kwargs
     t1, dt0, y0 = (kwargs.pop(name) for name in ("t1", "dt0", "y0"))
     own = [kwargs.pop(name) for name in ("num_paths", "replicates", "sort_by")]
-    sampling = kwargs.pop("sampling", None) or ds.ArrayRQMC(*own)
-    return ds.expectation(
-        phi, terms, solver, 0.0, t1, dt0, y0, 1.0, sampling=sampling, **kwargs
-    )
+    given = phi, terms, solver, 0.0, t1, dt0, y0, 1.0
+    return ds.expectation(*given, sampling=ds.ArrayRQMC(*own), **kwargs)
 
 
 def test_two_levels_extrapolate_and_are_exact_up_to_the_spread_that_they_report():
@@ -162,45 +156,6 @@ def test_solvers_of_diffrax_work_in_single_precision():
     assert abs(got.mean - 0.125 * (1 - np.exp(-2))) <= 1e-3
     assert got.std_error < 5e-4
     assert got.mean.dtype == np.float64
-
-
-PROGRAM = """
-import sys
-import types
-import jax
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
-from tests.expectation.test_array_rqmc import _numbers
-print(_numbers())
-"""
-
-
-def _numbers() -> list[str]:
-    """Of each sampling, to the last bit."""
-    samplings = (
-        ds.ArrayRQMC(64, 5),
-        ds.ValueFunctions(2, 96, 16),
-        ds.ValueFunctions(None, 96, 16),
-        ds.IndependentPaths(96, 16),
-    )
-    terms = ds.hamiltonian_terms(
-        lambda t, p, q, args: (p**2 + q**4) / 2,
-        lambda t, p, q, args: jnp.cos(q) / 2,
-        ds.WeakBrownianPath((), jr.key(0)),
-    )
-    each = [_estimate(VERLET, terms, sampling=s, dt0=0.25, levels=2) for s in samplings]
-    return [float(x).hex() for e in each for x in (e.mean, e.bias, e.std_error)]
-
-
-@pytest.mark.slow
-def test_one_device_and_eight_give_the_same_numbers():
-    root = str(Path(__file__).parents[2])
-    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": root}
-    out = subprocess.run(
-        [sys.executable, "-c", PROGRAM, "8"],
-        env=environment, cwd=root, stdout=subprocess.PIPE, text=True, check=True,
-    )  # fmt: skip
-    assert eval(out.stdout.splitlines()[-1]) == _numbers()
 
 
 def test_equal_paths_are_one_brownian_motion():

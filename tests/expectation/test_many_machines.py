@@ -2,12 +2,15 @@
 from the same arguments: others are refused by their names."""
 
 import dataclasses
+import functools as ft
 import os
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -206,7 +209,16 @@ def test_an_estimate_by_an_unknown_sampling_is_refused_by_name(
         ds.Expectation.load(tmp_path / "own.npz")
 
 
-PROGRAM = """
+def _started(program: str, *args) -> subprocess.Popen:
+    root = str(Path(__file__).parents[2])
+    command = [sys.executable, "-c", program, *map(str, args)]
+    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": root}
+    return subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, env=environment, cwd=root
+    )
+
+
+KILLED = """
 import os, signal, sys
 import jax
 jax.config.update("jax_enable_x64", True)
@@ -227,16 +239,95 @@ e.save(sys.argv[2])
 
 @pytest.mark.slow
 def test_two_processes_are_one_and_a_part_that_was_killed_is_done_again(tmp_path):
-    root = str(Path(__file__).parents[2])
-    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": root}
     file = lambda part: tmp_path / f"part{part}.npz"
-    start = lambda part, how: subprocess.Popen(
-        [sys.executable, "-c", PROGRAM, str(part), str(file(part)), how],
-        env=environment, cwd=root,
-    )  # fmt: skip
+    start = lambda part, how: _started(KILLED, part, file(part), how)
     processes = [start(0, "done"), start(1, "killed")]
     codes = [process.wait(timeout=300) for process in processes]
     assert codes == [0, -signal.SIGKILL] and not file(1).exists()
     assert start(1, "done").wait(timeout=300) == 0
     one, other = (ds.Expectation.load(file(part)) for part in (0, 1))
     assert _bits(other.merge(one)) == _bits(_part("IndependentPaths", 128))
+
+
+DEVICES = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
+if len(sys.argv) > 2:
+    address, rank = sys.argv[2:]
+    jax.distributed.initialize(address, num_processes=2, process_id=int(rank))
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+from tests.expectation import test_many_machines as here
+assert len(jax.devices()) == int(sys.argv[1]) * (2 if len(sys.argv) > 2 else 1)
+functions = here._of_solves, here._of_samplings, here._gradient
+print(*[x.hex() for f in functions[: 1 if len(sys.argv) > 2 else 3] for x in f()])
+"""
+
+
+def _observable(strength, key, **options):
+    noise = lambda t, p, q, args: strength * jnp.sin(q)
+    terms = ds.hamiltonian_terms(_spring, noise, ds.WeakBrownianPath((), key))
+    given = terms, ds.StormerVerlet(), 0.0, 0.5, 0.1, (jnp.array(0.0), jnp.array(1.0))
+    return diffrax.diffeqsolve(*given, jnp.array(1.0), **options).ys[1][-1]
+
+
+def _of_solves() -> list[float]:
+    fn = jax.tree_util.Partial(_observable, jnp.array(0.5))
+    e = ds.monte_carlo(fn, key=KEY, num_paths=3001, batch_size=100)
+    return [float(e.mean), float(e.std_error), float(e.num_paths)]
+
+
+def _of_samplings() -> list[float]:
+    samplings = (
+        ds.ArrayRQMC(64, 5),
+        ds.ValueFunctions(2, 96, 16),
+        ds.ValueFunctions(None, 96, 16),
+        ds.IndependentPaths(96, 16),
+    )
+    _, *given, y0, k, _ = _arguments(energy=lambda t, p, q, k: (p**2 + k * q**4) / 2)
+    given = lambda t, y, args: y[1] ** 2, *given, (jnp.array(0.0), jnp.array(1.0)), k
+    each = [ds.expectation(*given, key=KEY, levels=2, sampling=x) for x in samplings]
+    return [float(x) for e in each for x in (e.mean, e.bias, e.std_error)]
+
+
+def _gradient() -> list[float]:
+    """The mean of a gradient."""
+
+    def mean(**options):
+        gradient = jax.grad(ft.partial(_observable, **options))
+        fn = jax.tree_util.Partial(gradient, jnp.array(0.5))
+        return [float(ds.monte_carlo(fn, key=KEY, num_paths=100).mean)]
+
+    try:
+        return mean()
+    except ValueError as error:
+        # The default adjoint is refused on several devices from JAX 0.10 on.
+        said = "does not work on several devices. Pass `adjoint="
+        assert any(said in note for note in error.__notes__), error.__notes__
+        return mean(adjoint=diffrax.DirectAdjoint())
+
+
+@pytest.mark.slow
+def test_the_paths_are_the_same_on_any_devices_and_hosts():
+    def read(process):
+        out, _ = process.communicate(timeout=300)
+        assert process.returncode == 0
+        return [*map(float.fromhex, out.splitlines()[-1].split())]
+
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{s.getsockname()[1]}"
+    # Two processes with two devices each.
+    processes = [_started(DEVICES, 2, address, rank) for rank in (0, 1)]
+    for process in processes:
+        np.testing.assert_allclose(read(process), _of_solves(), rtol=1e-12)
+    eight = read(_started(DEVICES, 8))
+    np.testing.assert_allclose(eight[:3], _of_solves(), rtol=1e-12)
+    # To the last bit.
+    assert eight[3:-1] == _of_samplings()
+    np.testing.assert_allclose(eight[-1:], _gradient(), rtol=1e-12)
+    # Gradients are those by hand.
+    keys = jax.vmap(lambda i: jr.fold_in(jr.fold_in(KEY, 0), i))(jnp.arange(100))
+    by_hand = jax.vmap(lambda key: jax.grad(_observable)(0.5, key))(keys)
+    np.testing.assert_allclose(_gradient(), [np.mean(by_hand)], rtol=1e-12)

@@ -2,12 +2,6 @@
 counted that failed, and as many as a tolerance needs."""
 
 import dataclasses
-import functools
-import os
-import socket
-import subprocess
-import sys
-from pathlib import Path
 
 import diffrax
 import equinox as eqx
@@ -202,71 +196,6 @@ def test_old_style_keys_will_do():
     )
 
 
-PROGRAM = """
-import sys
-import jax
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
-if len(sys.argv) > 2:
-    address, rank = sys.argv[2:]
-    jax.distributed.initialize(address, num_processes=2, process_id=int(rank))
-    jax.config.update("jax_cpu_collectives_implementation", "gloo")
-import jax.random as jr
-import diffrax_symplectic as ds
-from tests.expectation.test_monte_carlo import _square
-assert len(jax.devices()) == int(sys.argv[1]) * (2 if len(sys.argv) > 2 else 1)
-e = ds.monte_carlo(_square, key=jr.key(0), num_paths=3001, batch_size=100)
-numbers = [float(e.mean), float(e.std_error), e.num_paths]
-if len(sys.argv) == 2:
-    import diffrax
-    from tests.expectation.test_monte_carlo import _gradient
-    try:
-        got = ds.monte_carlo(_gradient(), key=jr.key(0), num_paths=100)
-    except ValueError as error:
-        said = "does not work on several devices. Pass `adjoint="
-        assert any(said in note for note in error.__notes__), error.__notes__
-        direct = _gradient(diffrax.DirectAdjoint())
-        got = ds.monte_carlo(direct, key=jr.key(0), num_paths=100)
-    numbers.append(float(got.mean))
-print(*map(repr, numbers))
-"""
-
-
-def _start(program: str, *args) -> subprocess.Popen:
-    root = str(Path(__file__).parents[2])
-    command = [sys.executable, "-c", program, *map(str, args)]
-    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": root}
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, env=environment, cwd=root
-    )
-
-
-def _read(process: subprocess.Popen) -> list[float]:
-    out, _ = process.communicate(timeout=300)
-    assert process.returncode == 0
-    return [float(x) for x in out.splitlines()[-1].split()]
-
-
-@functools.cache
-def _of_three_devices() -> list[float]:
-    """Three devices of one process: an estimate, its error and paths, and a gradient."""
-    return _read(_start(PROGRAM, 3))
-
-
-@pytest.mark.slow
-def test_the_paths_are_the_same_on_any_devices_and_hosts():
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{s.getsockname()[1]}"
-    here = ds.monte_carlo(_square, key=jr.key(0), num_paths=3001, batch_size=100)
-    expected = [here.mean, here.std_error, here.num_paths]
-    np.testing.assert_allclose(_of_three_devices()[:3], expected, rtol=1e-12)
-    # Two processes with two devices each.
-    processes = [_start(PROGRAM, 2, address, rank) for rank in (0, 1)]
-    for process in processes:
-        np.testing.assert_allclose(_read(process), expected, rtol=1e-12)
-
-
 def test_results_within_phi_are_refused():
     of_solve = lambda key: (jr.normal(key), jr.normal(key), diffrax.RESULTS.successful)
     of_root = lambda key: (jr.normal(key), optx.RESULTS.successful)
@@ -295,31 +224,6 @@ def test_without_any_success_there_is_no_mean_and_it_can_go_on():
         )
     with pytest.raises(ValueError, match="needs a random key"):
         ds.monte_carlo(jr.normal, key=0, num_paths=10)
-
-
-def _gradient(adjoint=None):
-    if adjoint is None:
-        adjoint = diffrax.RecursiveCheckpointAdjoint()
-
-    def observable(strength, key):
-        H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
-        noise = lambda t, p, q, args: strength * jnp.sin(q)
-        terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), key))
-        y0, solver = (jnp.array(0.0), jnp.array(1.0)), ds.StormerVerlet()
-        sol = diffrax.diffeqsolve(terms, solver, 0.0, 0.5, 0.1, y0, adjoint=adjoint)
-        return sol.ys[1][-1]
-
-    return jax.tree_util.Partial(jax.grad(observable), jnp.array(0.5))
-
-
-@pytest.mark.slow
-def test_gradients_are_taken_within_and_on_several_devices():
-    one = jax.devices()[:1]
-    got = ds.monte_carlo(_gradient(), key=jr.key(0), num_paths=100, devices=one)
-    by_hand = np.mean(_by_hand(_gradient(), jr.key(0), 100))
-    np.testing.assert_allclose(got.mean, by_hand, rtol=1e-12)
-    # The default adjoint is refused from JAX 0.10 on, and that of the advice works.
-    np.testing.assert_allclose(_of_three_devices()[3], by_hand, rtol=1e-12)
 
 
 def test_newtons_method_takes_part_from_the_first_batch_that_needs_it():
