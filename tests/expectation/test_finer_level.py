@@ -75,12 +75,10 @@ def test_sorted_paths_say_which_changes_their_trial_could_not_see():
     assert "a trial with halved steps, on 512 paths, could only see" in str(got)
 
 
-def _oscillator(t, p, q, args):
-    return (p**2 + q**2) / 2
-
-
 S = 0.1
-DRIVEN = ds.hamiltonian_terms(_oscillator, lambda t, p, q, args: -S * q, ())
+DRIVEN = ds.hamiltonian_terms(
+    lambda t, p, q, args: (p**2 + q**2) / 2, lambda t, p, q, args: -S * q, ()
+)
 
 
 WEAK = Kicks(variables=("W", "second"))

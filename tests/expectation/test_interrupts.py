@@ -23,17 +23,12 @@ TERMS = ds.hamiltonian_terms(
 )
 
 
-def _square(t, y, args):
-    return y[1] ** 2
-
-
 def _mean(num_paths=512, **options):
     y0 = jnp.array(0.0), jnp.array(1.0)
     sampling = ds.IndependentPaths(num_paths, 256)
-    return ds.expectation(
-        _square, TERMS, ds.StormerVerlet(), 0, 1, 0.5, y0, key=jr.key(0),
-        sampling=sampling, **options,
-    )  # fmt: skip
+    square = lambda t, y, args: y[1] ** 2
+    given = square, TERMS, ds.StormerVerlet(), 0, 1, 0.5, y0
+    return ds.expectation(*given, key=jr.key(0), sampling=sampling, **options)
 
 
 def _interrupted(*args, **kwargs):

@@ -36,10 +36,6 @@ def _trap(stiffness):
     return lambda t, p, q, args: jnp.sum(p**2) / 2 + stiffness(t) * jnp.sum(q**2) / 2
 
 
-def _pushed(force):
-    return lambda t, p, q, args: (p**2 + q**2) / 2 - force(t) * q
-
-
 def _bath(H0, T=1.0, noise=(), **options):
     return ds.langevin_terms(H0, 0.5, T, noise, **options)
 
@@ -132,31 +128,16 @@ def test_a_slow_force_that_jumps_is_told_its_own_cure():
     assert message.endswith("mean of both sides at a jump.")
 
 
-def _hanging(t, p, q, args):
-    return jnp.sum(p**2) / 2 + _quench(t) * q[1]
-
-
-def _on_circle(q, args):
-    return jnp.sum(q**2, keepdims=True) - 1
-
-
-def _switched_on(t, y, args):
-    return jnp.where(t < 1, 0.0, 1.0) * jnp.ones(2), jnp.zeros(2)
-
-
-@pytest.mark.parametrize(
-    "terms",
-    [
-        _bath(_hanging, noise=(2,), constraint=_on_circle),
-        diffrax.MultiTerm(
-            *_bath(_trap(_constant), noise=(2,)).terms, diffrax.ODETerm(_switched_on)
-        ),
-    ],
-    ids=["constraint", "further term"],
-)
-def test_forces_under_a_constraint_or_in_a_further_term_are_told(terms):
+def test_forces_under_a_constraint_or_in_a_further_term_are_told():
     y0 = jnp.zeros(2), jnp.array([0.0, -1.0])
-    assert "jump at step ends, such as t=1," in _at_ends(terms, y0=y0)
+    hanging = lambda t, p, q, args: jnp.sum(p**2) / 2 + _quench(t) * q[1]
+    on_circle = lambda q, args: jnp.sum(q**2, keepdims=True) - 1
+    constrained = _bath(hanging, noise=(2,), constraint=on_circle)
+    switched_on = lambda t, y, args: (_quench(t) * jnp.ones(2), jnp.zeros(2))
+    further = diffrax.ODETerm(switched_on)
+    plain = _bath(_trap(_constant), noise=(2,)).terms
+    for terms in (constrained, diffrax.MultiTerm(*plain, further)):
+        assert "jump at step ends, such as t=1," in _at_ends(terms, y0=y0)
 
 
 def test_noise_that_jumps_at_a_step_end_is_told_for_solvers_that_take_it_there():
@@ -184,29 +165,27 @@ def test_single_precision_tells_of_jumps_and_not_of_smooth_forces():
     assert not is_told(lambda t: 1 + jnp.tanh(20 * (t - t0 - 0.9)) / 2)
 
 
-def _hot(t, q, args):
-    return jnp.where(t < WITHIN, 1.0, 10.0)
-
-
 def _late_quench(t):
     return _quench(t, WITHIN)
 
 
-def _late_push(t):
-    return 30 * jnp.sin(2 * t) + jnp.where(t < WITHIN, 0.0, 3.0)
+def _pushed(t, p, q, args):
+    return (p**2 + q**2) / 2 - (30 * jnp.sin(2 * t) + _late_quench(t)) * q
 
 
-@pytest.mark.parametrize(
-    "terms, solver",
-    [
-        (_bath(_trap(_late_quench)), ds.ImplicitMidpoint()),
-        (_bath(_trap(_constant), _hot), ds.BAOAB(ds.ImplicitMidpoint())),
-        (_driven(_late_quench, _constant), diffrax.Heun()),
-        (_driven(_constant, _late_quench), ds.StormerVerlet()),
-        (_bath(_pushed(_late_push)), BAOAB),
-    ],
-    ids=["stiffness", "temperature", "forces", "noise", "beside a large smooth drive"],
-)
+WITHIN_A_STEP = {
+    "stiffness": (_bath(_trap(_late_quench)), ds.ImplicitMidpoint()),
+    "temperature": (
+        _bath(_trap(_constant), lambda t, q, args: _late_quench(t)),
+        ds.BAOAB(ds.ImplicitMidpoint()),
+    ),
+    "forces": (_driven(_late_quench, _constant), diffrax.Heun()),
+    "noise": (_driven(_constant, _late_quench), ds.StormerVerlet()),
+    "beside a large smooth drive": (_bath(_pushed), BAOAB),
+}
+
+
+@pytest.mark.parametrize("terms, solver", WITHIN_A_STEP.values(), ids=WITHIN_A_STEP)
 def test_a_jump_within_a_step_is_told_with_its_time_for_any_solver(terms, solver):
     assert "jump within a step, such as at t=1.03." in _within(terms, solver)
 

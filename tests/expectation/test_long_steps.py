@@ -204,23 +204,15 @@ def test_noise_that_turns_nothing_is_always_resolved():
 
 
 FREQUENCY = 200.0
-LOSS = 0.04
-
-
-def _fast_well(t, p, q, args):
-    return args * (p**2 + q**2) / 2
-
-
-def _with_loss(t, y, args):
-    """The drift of the same oscillator with its loss written into it."""
-    p, q = y
-    return -args * q - LOSS * p, args * p
 
 
 def test_implicit_steps_that_keep_what_decays_are_told_in_every_unit_of_time():
-    bath = ds.langevin_terms(_fast_well, LOSS / FREQUENCY, FREQUENCY, ())
-    kick = ds.noise_terms(lambda t, p, q, args: -((2 * LOSS) ** 0.5) * q, ())
-    written = diffrax.MultiTerm(diffrax.ODETerm(_with_loss), kick)
+    well, loss = lambda t, p, q, args: args * (p**2 + q**2) / 2, 0.04
+    bath = ds.langevin_terms(well, loss / FREQUENCY, FREQUENCY, ())
+    # The drift of the same oscillator with its loss written into it.
+    drift = lambda t, y, args: (-args * y[1] - loss * y[0], args * y[0])
+    kick = ds.noise_terms(lambda t, p, q, args: -((2 * loss) ** 0.5) * q, ())
+    written = diffrax.MultiTerm(diffrax.ODETerm(drift), kick)
     y0 = jnp.array(0.0), jnp.array(5.0)
     slowly = "relaxes far too slowly"
     midpoint = ds.ImplicitMidpoint()
