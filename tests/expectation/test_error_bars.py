@@ -55,8 +55,10 @@ def test_the_spread_of_small_and_large_numbers_is_known(dtype, sizes):
     assert few.num_paths == 4000
 
 
-def test_what_is_zero_or_underflows_on_all_paths_is_told():
+def test_values_that_overflow_or_are_zero_or_underflow_on_all_paths_are_told():
     run = lambda fn: ds.monte_carlo(fn, key=KEY, num_paths=100)
+    with pytest.warns(UserWarning, match="or its standard error is not finite"):
+        run(lambda key: 1e308 * jr.rademacher(key, dtype=float))
     with pytest.warns(UserWarning, match="indicator of a rare event"):
         run(lambda key: jr.normal(key) > 9)
     with pytest.warns(UserWarning, match="underflows float32"):
