@@ -260,10 +260,13 @@ def test_solvers_with_friction_in_the_drift_are_told_beyond_their_limit():
         for scale in SCALES:
             for factor in (0.9, 1.1):
                 h = factor * most * 0.5 / 0.8 * scale
-                is_told = _is_told_of_friction(
-                    terms, solver, h, THREE, (jnp.array(scale),)
-                )
-                assert is_told == (factor > 1)
+                given = terms, solver, h, THREE, (jnp.array(scale),)
+                assert _is_told_of_friction(*given) == (factor > 1)
+    # Others are for every friction.
+    terms = ds.langevin_terms(_in_unit_of_time, 100.0, 1.0, (3,))
+    for solver in (BAOAB, ds.LangevinMiddle(), ds.ImplicitMidpoint(), ds.SRKw1()):
+        given = terms, solver, 0.2, THREE, (jnp.array(1.0),)
+        assert not _is_told_of_friction(*given)
 
 
 def test_a_flow_that_keeps_overdamped_positions_where_they_are_is_told():
