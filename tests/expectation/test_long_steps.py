@@ -39,9 +39,8 @@ def _pendulum(t, p, q, args):
 OSCILLATOR = ds.hamiltonian_terms(_well, lambda t, p, q, args: jnp.sin(q[0]) / 5, ())
 
 
-@pytest.mark.parametrize("size", [1, 100])
-def test_the_limit_of_stability_is_told(size):
-    y0 = jnp.zeros(size), jnp.ones(size)
+def test_the_limit_of_stability_is_told():
+    y0 = jnp.zeros(100), jnp.ones(100)
     for h in (1.99, 2.02):
         # With three levels, too: unstable steps may fit the order by chance.
         for levels in (2, 3):
@@ -226,15 +225,14 @@ def test_implicit_steps_that_keep_what_decays_are_told_in_every_unit_of_time():
     assert not _is_told(bath, splitting, 1.0, y0, FREQUENCY, num_steps=100)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
-def test_rounding_and_a_turning_saddle_are_no_decay(dtype):
+def test_rounding_and_a_turning_saddle_are_no_decay():
     def turning_saddle(t, p, q, args):
         # The rates of its modes are (+-1 +- 3 i) args: what decays also grows.
         return args * (p @ q + 3 * p[0] * q[1] - 3 * p[1] * q[0])
 
     kick = lambda t, p, q, args: q[0] / 100
     fast_pair = lambda t, p, q, args: args * (p @ p + q @ q) / 2 + q[0] * q[1]
-    y0 = jnp.zeros(2, dtype), jnp.ones(2, dtype)
+    y0 = jnp.zeros(2, jnp.float32), jnp.ones(2, jnp.float32)
     for H0 in (turning_saddle, fast_pair):
         terms = ds.hamiltonian_terms(H0, kick, ())
         given = terms, ds.ImplicitMidpoint(), 1.0, y0, FREQUENCY
@@ -306,13 +304,12 @@ def _turning(t, q, args):
     return as_friction(strong * scale * turn @ jnp.diag(jnp.array([1.0, 0.1])) @ turn.T)
 
 
-@pytest.mark.parametrize("solver", [BAOAB, IMPLICIT_BAOAB], ids=repr)
-def test_friction_that_turns_far_in_a_step_is_told_in_any_unit_of_time(solver):
+def test_friction_that_turns_far_in_a_step_is_told_in_any_unit_of_time():
     terms = ds.langevin_terms(_free_in_unit_of_time, _turning, 1.0, (2,))
 
     def is_told(strong, turns, h, scale=1.0):
         args = jnp.array(scale), jnp.array(strong), jnp.array(turns)
-        return _is_told_of_friction(terms, solver, h * scale, PLANE, args)
+        return _is_told_of_friction(terms, BAOAB, h * scale, PLANE, args)
 
     for scale in SCALES:
         assert is_told(5.0, 2.0, 1.0, scale)
