@@ -26,13 +26,10 @@ def H0(t, p, q, args):
 Y0 = jnp.zeros(()), jnp.ones(())
 
 
-def _mean(path, sampling=None, y0=Y0, t0=0.0, t1=1.0, dt0=0.1, **others):
+def _mean(path, sampling=None, **others):
     terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: 0.1 * q, path)
-    phi = lambda t, y, args: y[1] ** 2
-    return ds.expectation(
-        phi, terms, ds.StormerVerlet(), t0, t1, dt0, y0, key=jr.key(0),
-        sampling=sampling, **others,
-    )  # fmt: skip
+    given = lambda t, y, args: y[1] ** 2, terms, ds.StormerVerlet(), 0.0, 1.0, 0.1, Y0
+    return ds.expectation(*given, key=jr.key(0), sampling=sampling, **others)
 
 
 @pytest.mark.parametrize(
@@ -43,7 +40,7 @@ def test_recorded_noise_has_no_mean(sampling):
         _mean(RECORD, sampling)
 
 
-class Kicks(diffrax.AbstractBrownianPath):
+class OwnPath(diffrax.AbstractBrownianPath):
     """A path of a user's own that draws its noise."""
 
     key: jax.Array
@@ -57,15 +54,15 @@ class Kicks(diffrax.AbstractBrownianPath):
 
 
 def test_random_noise_of_a_path_of_ones_own_has_one():
-    estimate = _mean(Kicks(jr.key(0)), ds.IndependentPaths(4000), levels=1)
+    estimate = _mean(OwnPath(jr.key(0)), ds.IndependentPaths(4000), levels=1)
     exact = moment(Cell("additive", 0.1, 1.0, 10), 2)[4]
     assert 0 < abs(estimate.mean - exact) <= 4 * estimate.std_error
 
 
 def test_only_the_key_of_a_path_is_replaced():
     key, old, table = jr.key(0), jr.PRNGKey(0), jnp.arange(5, dtype=jnp.uint32)
-    path = Kicks((key, {"table": table, "old": old}))
-    assert not is_random(Kicks(table)) and is_random(Kicks(old))
+    path = OwnPath((key, {"table": table, "old": old}))
+    assert not is_random(OwnPath(table)) and is_random(OwnPath(old))
     new = with_keys(path, path_keys(path, jr.key(1))).key
     assert new[1]["table"] is table
     np.testing.assert_array_equal(jr.key_data(new[0]), new[1]["old"])

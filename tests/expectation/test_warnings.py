@@ -34,14 +34,10 @@ START = jnp.ones(1)
 KEY = jr.key(1)
 
 
-def walk(noise, path) -> diffrax.AbstractTerm:
-    """Terms without drift: these compile fastest."""
-    return diffrax.ControlTerm(noise, path)
-
-
-WEAK = walk(lambda t, y, args: y, ds.WeakBrownianPath((), jr.key(0)))
+# Terms without drift: these compile fastest.
+WEAK = diffrax.ControlTerm(lambda t, y, args: y, ds.WeakBrownianPath((), jr.key(0)))
 GAUSSIAN_PATH = ds.FixedStepBrownianPath((), jr.key(0))
-GAUSSIAN = walk(lambda t, y, args: y, GAUSSIAN_PATH)
+GAUSSIAN = diffrax.ControlTerm(lambda t, y, args: y, GAUSSIAN_PATH)
 FEW = ds.IndependentPaths(100)
 
 
@@ -99,7 +95,7 @@ def test_with_three_levels_fewer_looks_are_taken_and_with_one_none(monkeypatch):
 def test_of_rounding():
     y0 = jnp.ones(1, jnp.float32)
     path = ds.WeakBrownianPath(jax.ShapeDtypeStruct((), jnp.float32), jr.key(0))
-    terms = walk(lambda t, y, args: 1e-6 * y, path)
+    terms = diffrax.ControlTerm(lambda t, y, args: 1e-6 * y, path)
     here(mean(terms, y0), "Rounding errors may be larger")
 
 
@@ -117,7 +113,9 @@ def test_of_a_fit_that_takes_long(monkeypatch):
 
 
 def test_of_failed_paths():
-    lost = walk(lambda t, y, args: jnp.where(y > 1.5, jnp.nan, y), GAUSSIAN_PATH)
+    lost = diffrax.ControlTerm(
+        lambda t, y, args: jnp.where(y > 1.5, jnp.nan, y), GAUSSIAN_PATH
+    )
     here(follow(lost, diffrax.Heun()), "`temperature` or `friction` that is negative")
 
 
@@ -135,6 +133,8 @@ def test_of_stragglers():
 
 
 def test_of_truncated_increments():
-    terms = walk(lambda t, y, args: y, ds.TruncatedBrownianPath(GAUSSIAN_PATH))
+    terms = diffrax.ControlTerm(
+        lambda t, y, args: y, ds.TruncatedBrownianPath(GAUSSIAN_PATH)
+    )
     here(follow(terms, diffrax.Heun()), "lose 16.2% of their variance")
     here(mean(terms, levels=1), "lose 16.2% of their variance")
