@@ -324,7 +324,9 @@ class RecordingMeter(diffrax.AbstractProgressMeter):
     """Writes down what is asked of it."""
 
     calls: list
-    fails_at: int | None = None
+    # The number of a step, or "close".
+    fails_at: int | str | None = None
+    error: type[BaseException] = RuntimeError
 
     def init(self):
         self.calls.append("init")
@@ -333,8 +335,10 @@ class RecordingMeter(diffrax.AbstractProgressMeter):
     def step(self, state, progress):
         self.calls.append(float(progress))
         if state == self.fails_at:
-            raise RuntimeError("stop here")
+            raise self.error("stop here")
         return state + 1
 
     def close(self, state):
         self.calls.append(("closed after", state))
+        if self.fails_at == "close":
+            raise self.error("stop here")

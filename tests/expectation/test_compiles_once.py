@@ -9,10 +9,10 @@ from jax import monitoring
 import diffrax_symplectic as ds
 from diffrax_symplectic._expectation import finer_level
 from diffrax_symplectic._expectation.fitted.noise import Noise
-from diffrax_symplectic._simulation.problem import Problem
 
 from ..drjit_here import needs_drjit
 from ..picard import by_picard
+from .steps import problem_of
 
 
 COMPILED = "/jax/core/compile/backend_compile_duration"
@@ -63,26 +63,36 @@ def mean(**kwargs):
     return ds.expectation(phi, **kwargs)
 
 
-fused = lambda *values: pytest.param(*values, "drjit", marks=needs_drjit)
+FEW = ds.IndependentPaths(64)
 RUNS = {
-    "IndependentPaths": (mean, dict(sampling=ds.IndependentPaths(64)), None),
-    "IndependentPaths, fused": fused(mean, dict(sampling=ds.IndependentPaths(64))),
-    "ArrayRQMC": (mean, dict(sampling=ds.ArrayRQMC(64, 2)), None),
-    "ValueFunctions": pytest.param(
-        mean,
-        dict(sampling=ds.ValueFunctions(degree=2, num_paths=64)),
-        None,
-        marks=pytest.mark.slow,
+    "IndependentPaths": (mean, dict(sampling=FEW)),
+    "IndependentPaths, fused": pytest.param(
+        mean, dict(sampling=FEW, engine="drjit"), marks=needs_drjit
     ),
-    "ensemble": (ds.ensemble, dict(num_paths=64), None),
-    "ensemble, fused": fused(ds.ensemble, dict(num_paths=64)),
+    "ArrayRQMC": (mean, dict(sampling=ds.ArrayRQMC(64, 8))),
+    "ValueFunctions": (mean, dict(sampling=ds.ValueFunctions(2, 64))),
+    "ensemble": (ds.ensemble, dict(num_paths=64)),
 }
 
 
-@pytest.mark.parametrize("run, sampling, engine", RUNS.values(), ids=RUNS)
-def test_a_call_with_other_numbers_compiles_nothing(run, sampling, engine):
-    sampling = sampling | {"engine": engine}
+@pytest.mark.parametrize("run, sampling", RUNS.values(), ids=RUNS)
+def test_a_call_with_other_numbers_compiles_nothing(monkeypatch, run, sampling):
+    changes_of = finer_level._changes_by_same_sampling
+
+    def changes_of_trial(*args):
+        """A trial with halved steps compiles neither samples nor fits. Small programs, of
+        keys, do not count."""
+        before = len(compiled)
+        changes = changes_of(*args)
+        assert not [name for name in compiled[before:] if "of_arrays" in name]
+        trials.append(changes)
+        return changes
+
+    trials = []
+    monkeypatch.setattr(finer_level, "_changes_by_same_sampling", changes_of_trial)
     call(run, sampling)
+    has_trial = not isinstance(sampling.get("sampling", FEW), ds.IndependentPaths)
+    assert len(trials) == has_trial
     anew = {}
     for name, change in CHANGES.items():
         compiled.clear()
@@ -109,36 +119,7 @@ def test_xla_does_not_know_the_result_before_a_step_of_a_fit():
     H = lambda t, p, q, args: (p**2 + q**2) / 2
     terms = ds.hamiltonian_terms(H, H, ())
     y0 = jnp.array(0.0), jnp.array(1.0)
-    problem = Problem.of(
-        lambda t, y, args: y[1],
-        terms,
-        ds.ImplicitMidpoint(),
-        0,
-        1,
-        0.5,
-        y0,
-        None,
-        None,
-        1,
-    )
+    problem = problem_of(terms, ds.ImplicitMidpoint(), 0.5, y0, num_steps=2, levels=1)
     noise = Noise.of(problem, problem.level(0))
     program = jax.jit(lambda y: noise.new_solver_state(0, y)).lower(y0).as_text()
     assert "optimization_barrier" in program
-
-
-@pytest.mark.parametrize("sampling", [ds.ValueFunctions(2, 64), ds.ArrayRQMC(64, 8)])
-def test_a_trial_with_halved_steps_compiles_nothing(monkeypatch, sampling):
-    changes_of = finer_level._changes_by_same_sampling
-    names = []
-
-    def changes(*args):
-        before = len(compiled)
-        result = changes_of(*args)
-        names.append(compiled[before:])
-        return result
-
-    monkeypatch.setattr(finer_level, "_changes_by_same_sampling", changes)
-    call(mean, dict(sampling=sampling))
-    (names_of_trial,) = names
-    # Those of samples and of fits. Small ones, of keys, do not count.
-    assert not [name for name in names_of_trial if "of_arrays" in name]

@@ -95,13 +95,8 @@ def test_other_files_are_refused_without_advice_to_unpickle(tmp_path):
     np.savez(objects, header=np.array([{}], object))
     single = io.BytesIO()
     np.save(single, np.ones(3))
-    for content in (
-        b"",
-        b"mean 1.0\n" * 9,
-        pickle.dumps({"mean": 1.0}),
-        objects.getvalue(),
-        single.getvalue(),
-    ):
+    others = b"", b"mean 1.0\n" * 9, pickle.dumps({"mean": 1.0})
+    for content in (*others, objects.getvalue(), single.getvalue()):
         (tmp_path / "other.npz").write_bytes(content)
         with pytest.raises(ValueError, match="other.npz is damaged, or was") as info:
             ds.Expectation.load(tmp_path / "other.npz")
@@ -125,15 +120,9 @@ RANGES = [[0, 32, 32, 0, [0]], [32, 40, 8, 0, [0]]]
     "changes",
     [
         *[{"ranges": [first, RANGES[1]]} for first in (
-            [0, 32, -1, 0, [0]],
-            [0, 32, 33, 0, [0]],
-            [0, 32, 31, 33, [33]],
-            [0, 32, 32, 0, [1]],
-            [0, 33, 32, 0, [0]],
-            [0, 32.0, 32, 0, [0]],
-            [-8, 32, 32, 0, [0]],
-            [0, 32, 32, 0, []],
-            [0, 32, 32, 0, [0, 0]],
+            [0, 32, -1, 0, [0]], [0, 32, 33, 0, [0]], [0, 32, 31, 33, [33]],
+            [0, 32, 32, 0, [1]], [0, 33, 32, 0, [0]], [0, 32.0, 32, 0, [0]],
+            [-8, 32, 32, 0, [0]], [0, 32, 32, 0, []], [0, 32, 32, 0, [0, 0]],
         )],
         {"ranges": []},
         {"ranges": [RANGES[0], [2**70, 2**70 + 8, 8, 0, [0]]]},

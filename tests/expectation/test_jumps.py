@@ -1,4 +1,5 @@
-"""Forces and noise that jump in time are told where two levels do not show their error."""
+"""Forces and noise that jump in time, or change too fast for the steps, are told where two
+levels do not show their error."""
 
 import warnings
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation.fast_drive import unresolved_drive
 from diffrax_symplectic._expectation.jumps import jumps_at_step_ends, jumps_within_steps
 
 from .steps import problem_of
@@ -32,10 +34,6 @@ def _quench_by_mean(t):
 def _trap(stiffness):
     """The Hamiltonian of a trap with this function of time."""
     return lambda t, p, q, args: jnp.sum(p**2) / 2 + stiffness(t) * jnp.sum(q**2) / 2
-
-
-def _pushed(force):
-    return lambda t, p, q, args: (p**2 + q**2) / 2 - force(t) * q
 
 
 def _bath(H0, T=1.0, noise=(), **options):
@@ -91,9 +89,8 @@ def test_only_jumps_are_told():
 
 
 def test_what_does_not_depend_on_time_is_not_told():
-    for stiffness in (_constant, lambda t: 1 + 0 * t):
-        assert _at_ends(_bath(_trap(stiffness))) is None
-        assert _within(_bath(_trap(stiffness))) is None
+    assert _at_ends(_bath(_trap(_constant))) is None
+    assert _within(_bath(_trap(_constant))) is None
 
 
 def test_a_jump_at_a_step_end_is_told_with_its_time_and_a_cure():
@@ -131,31 +128,16 @@ def test_a_slow_force_that_jumps_is_told_its_own_cure():
     assert message.endswith("mean of both sides at a jump.")
 
 
-def _hanging(t, p, q, args):
-    return jnp.sum(p**2) / 2 + _quench(t) * q[1]
-
-
-def _on_circle(q, args):
-    return jnp.sum(q**2, keepdims=True) - 1
-
-
-def _switched_on(t, y, args):
-    return jnp.where(t < 1, 0.0, 1.0) * jnp.ones(2), jnp.zeros(2)
-
-
-@pytest.mark.parametrize(
-    "terms",
-    [
-        _bath(_hanging, noise=(2,), constraint=_on_circle),
-        diffrax.MultiTerm(
-            *_bath(_trap(_constant), noise=(2,)).terms, diffrax.ODETerm(_switched_on)
-        ),
-    ],
-    ids=["constraint", "further term"],
-)
-def test_forces_under_a_constraint_or_in_a_further_term_are_told(terms):
+def test_forces_under_a_constraint_or_in_a_further_term_are_told():
     y0 = jnp.zeros(2), jnp.array([0.0, -1.0])
-    assert "jump at step ends, such as t=1," in _at_ends(terms, y0=y0)
+    hanging = lambda t, p, q, args: jnp.sum(p**2) / 2 + _quench(t) * q[1]
+    on_circle = lambda q, args: jnp.sum(q**2, keepdims=True) - 1
+    constrained = _bath(hanging, noise=(2,), constraint=on_circle)
+    switched_on = lambda t, y, args: (_quench(t) * jnp.ones(2), jnp.zeros(2))
+    further = diffrax.ODETerm(switched_on)
+    plain = _bath(_trap(_constant), noise=(2,)).terms
+    for terms in (constrained, diffrax.MultiTerm(*plain, further)):
+        assert "jump at step ends, such as t=1," in _at_ends(terms, y0=y0)
 
 
 def test_noise_that_jumps_at_a_step_end_is_told_for_solvers_that_take_it_there():
@@ -169,8 +151,8 @@ def test_noise_that_jumps_at_a_step_end_is_told_for_solvers_that_take_it_there()
         assert _at_ends(terms, solver) is None
 
 
-@pytest.mark.parametrize("t0", [0.0, 100.0])
-def test_single_precision_tells_of_jumps_and_not_of_smooth_forces(t0):
+def test_single_precision_tells_of_jumps_and_not_of_smooth_forces():
+    t0 = 100.0
     y0 = jnp.zeros((), jnp.float32), jnp.full((), 2.0, jnp.float32)
 
     def is_told(stiffness):
@@ -183,30 +165,27 @@ def test_single_precision_tells_of_jumps_and_not_of_smooth_forces(t0):
     assert not is_told(lambda t: 1 + jnp.tanh(20 * (t - t0 - 0.9)) / 2)
 
 
-def _hot(t, q, args):
-    return jnp.where(t < WITHIN, 1.0, 10.0)
-
-
 def _late_quench(t):
     return _quench(t, WITHIN)
 
 
-@pytest.mark.parametrize(
-    "terms, solver",
-    [
-        (_bath(_trap(_late_quench)), ds.ImplicitMidpoint()),
-        (_bath(_trap(_constant), _hot), ds.BAOAB(ds.ImplicitMidpoint())),
-        (_driven(_late_quench, _constant), diffrax.Heun()),
-        (_driven(_constant, _late_quench), ds.StormerVerlet()),
-        (
-            _bath(
-                _pushed(lambda t: 30 * jnp.sin(2 * t) + jnp.where(t < WITHIN, 0.0, 3.0))
-            ),
-            BAOAB,
-        ),
-    ],
-    ids=["stiffness", "temperature", "forces", "noise", "beside a large smooth drive"],
-)
+def _pushed(t, p, q, args):
+    return (p**2 + q**2) / 2 - (30 * jnp.sin(2 * t) + _late_quench(t)) * q
+
+
+WITHIN_A_STEP = {
+    "stiffness": (_bath(_trap(_late_quench)), ds.ImplicitMidpoint()),
+    "temperature": (
+        _bath(_trap(_constant), lambda t, q, args: _late_quench(t)),
+        ds.BAOAB(ds.ImplicitMidpoint()),
+    ),
+    "forces": (_driven(_late_quench, _constant), diffrax.Heun()),
+    "noise": (_driven(_constant, _late_quench), ds.StormerVerlet()),
+    "beside a large smooth drive": (_bath(_pushed), BAOAB),
+}
+
+
+@pytest.mark.parametrize("terms, solver", WITHIN_A_STEP.values(), ids=WITHIN_A_STEP)
 def test_a_jump_within_a_step_is_told_with_its_time_for_any_solver(terms, solver):
     assert "jump within a step, such as at t=1.03." in _within(terms, solver)
 
@@ -239,3 +218,71 @@ def test_two_levels_agree_on_a_wrong_mean_unless_the_cure_is_taken(stiffness, is
         got = ds.expectation(*given, key=jr.key(0), sampling=sampling)
     # By the equations of the moments before and after time 1.
     assert (abs(got.mean - 0.7037) < got.error) == is_right
+
+
+WIDTHS = 0.03, 0.01, 1e-3
+
+
+def _tenfold(t):
+    return jnp.cos(2 * jnp.pi * 10 * t)
+
+
+def _pulse(width):
+    return lambda t: jnp.exp(-(((t - 10.06) / width) ** 2) / 2) / width
+
+
+UNRESOLVED = {
+    "its period divides all steps": _tenfold,
+    "beside a slow one": lambda t: jnp.cos(t) + 0.1 * _tenfold(t),
+} | {f"a pulse of {width} between stages": _pulse(width) for width in WIDTHS}
+RESOLVED = {
+    "constant": lambda t: 1.0 + 0 * t,
+    "a third of a period in a step": lambda t: jnp.cos(2 * jnp.pi / 3 * t / 0.2),
+    "a ramp": lambda t: t,
+    "a pulse over many steps": lambda t: jnp.exp(-(((t - 10) / 2) ** 2)),
+    "a quench at a step end": lambda t: jnp.where(t < 10, 0.0, 1.0),
+    "a quench with a mean": lambda t: (
+        jnp.where(t < 10 - 1e-9, 0.0, 0.5) + jnp.where(t < 10 + 1e-9, 0.0, 0.5)
+    ),
+    "a fast ripple that is too small": lambda t: 1 + 1e-6 * _tenfold(t),
+}
+
+
+def _message(terms, args=None, levels=2):
+    """For steps of 0.4, and fractions of it."""
+    solver = ds.BAOAB(ds.ImplicitMidpoint())
+    problem = problem_of(terms, solver, 0.4, REST, args, num_steps=50, levels=levels)
+    return unresolved_drive(problem)
+
+
+def test_only_fast_drives_are_told():
+    """One program for all of them, in which a number selects the force."""
+    forces = UNRESOLVED | RESOLVED
+
+    def energy(t, p, q, number):
+        return (p**2 + q**2) / 2 - jax.lax.switch(number, [*forces.values()], t) * q
+
+    terms = ds.langevin_terms(energy, 0.5, 0.1, ())
+    for number, name in enumerate(forces):
+        told = _message(terms, jnp.array(number)) is not None
+        assert told == (name in UNRESOLVED), name
+
+
+@pytest.mark.parametrize("levels, shortest", [(2, "0.2"), (3, "0.1")])
+def test_noise_that_changes_fast_is_told_with_the_shortest_steps(levels, shortest):
+    energy = lambda t, p, q, args: (p**2 + q**2) / 2
+    noise = lambda t, p, q, args: (1 + _tenfold(t)) * q
+    terms = ds.hamiltonian_terms(energy, noise, ())
+    message = _message(terms, levels=levels)
+    assert f"steps of {shortest}, the shortest" in message
+
+
+def test_flips_at_random_times_are_not_told():
+    def flips(key):
+        return jr.uniform(key, (8,), minval=0.0, maxval=20.0)
+
+    def energy(t, p, q, times):
+        sign = jnp.prod(jnp.where(t < times, 1.0, -1.0))
+        return (p**2 + q**2) / 2 - sign * q
+
+    assert _message(ds.langevin_terms(energy, 0.5, 0.1, ()), flips) is None

@@ -1,7 +1,5 @@
 """The law of the increments where phi is not smooth."""
 
-import warnings
-
 import jax
 import jax.numpy as jnp
 import jax.random as jr
@@ -10,13 +8,16 @@ import pytest
 from scipy.special import ndtr
 
 import diffrax_symplectic as ds
+from diffrax_symplectic._expectation.choose import choose
 from diffrax_symplectic._expectation.kinks import may_have_kinks
+from diffrax_symplectic._simulation import Problem
+from diffrax_symplectic._terms import brownian_paths
 
-from ..picard import by_picard
+from .steps import Kicks
 
 
+KEY = jr.key(1)
 Y0 = jnp.array(0.0), jnp.array(0.0)
-STEPS = 4
 
 
 def walk(path):
@@ -27,28 +28,6 @@ def walk(path):
 
 def beyond(t, y, args):
     return jnp.where(y[0] > 0.5, 1.0, 0.0)
-
-
-def mean(phi, terms, **kwargs):
-    solver = ds.StormerVerlet()
-    return ds.expectation(
-        phi, terms, solver, 0, 1, 1 / STEPS, Y0, key=jr.key(1), **kwargs
-    )
-
-
-@pytest.mark.parametrize(
-    "phi, kinks",
-    [
-        (lambda y: y[0][1] * y[1][-1] ** 2, False),
-        (lambda y: jnp.exp(jnp.cos(y[0])) / (1 + y[1] ** 2), False),
-        (lambda y: jnp.abs(y[0]), True),
-        (lambda y: jax.jit(jnp.maximum)(y[0], 0), True),
-        (lambda y: jax.lax.cond(True, jnp.abs, jnp.sin, y[0]), True),
-        (lambda y: jnp.clip(jnp.arange(3.0), 0, 1) * y[0], False),
-    ],
-)
-def test_kinks_are_seen_in_the_operations(phi, kinks):
-    assert may_have_kinks(phi, (jnp.zeros(3), jnp.ones(3))) == kinks
 
 
 def _square_and_size(x):
@@ -66,39 +45,47 @@ def _square_after_a_loop(x):
     return x**2
 
 
-def _square_of_some(x):
-    message_needs = x > 3
-    del message_needs
-    return x**2
+SMOOTH = [
+    lambda x: x[1] * x[-1] ** 2,
+    lambda x: jnp.exp(jnp.cos(x)) / (1 + x**2),
+    # No comparison of what depends on the state.
+    lambda x: jnp.clip(jnp.arange(3.0), 0, 1) * x,
+    # Comparisons that no result needs.
+    lambda x: (x**2, x > 3)[0],
+    lambda x: jax.jit(_square_and_size)(x)[0],
+    lambda x: jax.lax.cond(True, _square_and_size, _square_and_size, x)[0],
+    _square_after_a_loop,
+]
+KINKED = [
+    jnp.abs,
+    lambda x: jax.jit(jnp.maximum)(x, 0),
+    lambda x: jax.jit(_square_and_size)(x)[1],
+    lambda x: jax.lax.cond(True, jnp.abs, jnp.sin, x),
+]
 
 
-@pytest.mark.parametrize(
-    "phi, kinks",
-    [
-        (_square_of_some, False),
-        (lambda x: _square_and_size(x)[0], False),
-        (lambda x: jax.jit(_square_and_size)(x)[0], False),
-        (lambda x: jax.jit(_square_and_size)(x)[1], True),
-        (_square_after_a_loop, False),
-        (lambda x: jax.lax.cond(True, _square_and_size, _square_and_size, x)[0], False),
-        (lambda x: jax.jit(_square_of_some)(x), False),
-    ],
-)
-def test_a_comparison_that_no_result_needs_is_no_kink(phi, kinks):
-    assert may_have_kinks(phi, jnp.ones(3)) == kinks
+def test_kinks_are_seen_in_the_operations_that_a_result_needs():
+    for number, phi in enumerate(SMOOTH + KINKED):
+        assert may_have_kinks(phi, jnp.ones(3)) == (phi in KINKED), number
 
 
 def test_a_shape_becomes_a_gaussian_path_where_phi_jumps():
-    estimate = mean(beyond, walk(()))
-    assert isinstance(estimate.sampling, ds.ArrayRQMC)
-    assert "Gaussian increments" in estimate.reason
-    assert abs(estimate.mean - ndtr(-0.5)) < 4 * estimate.std_error < 2e-3
+    def problem_for(want):
+        given = beyond, walk(()), ds.StormerVerlet(), 0, 1, 0.25, Y0, None, None, 1
+        return Problem.of(*given, key=KEY, want=want)
+
+    given = False, KEY, None, None, None, None, jax.devices()[:1]
+    problem, sampling, plan = choose(problem_for, *given)
+    (path,) = brownian_paths(problem.terms)
+    assert isinstance(path, ds.FixedStepBrownianPath)
+    assert isinstance(sampling, ds.ArrayRQMC)
+    assert "Gaussian increments" in plan.reason
 
 
 def test_a_weak_method_has_no_gaussian_path():
-    options = dict(key=jr.key(1), sampling=ds.IndependentPaths(10))
-    solver = by_picard(ds.SRKw5())
-    with pytest.warns(UserWarning, match="`SRKw5` has discrete increments alone"):
+    options = dict(key=KEY, sampling=ds.IndependentPaths(10), levels=1)
+    solver = Kicks(variables=("W", "second"))
+    with pytest.warns(UserWarning, match="`Kicks` has discrete increments alone"):
         estimate = ds.expectation(beyond, walk(()), solver, 0, 1, 0.5, Y0, **options)
     assert "Gaussian" not in estimate.reason
 
@@ -110,22 +97,22 @@ def test_a_trial_with_gaussian_increments_is_made_at_long_steps_too():
     well = lambda t, p, q, args: (p**2 + q**2) / 2
     terms = ds.hamiltonian_terms(well, spring, ds.WeakBrownianPath((), jr.key(0)))
     y0 = jnp.array(0.0), jnp.array(1.0)
-    options = dict(key=jr.key(1), sampling=ds.IndependentPaths(1000))
-    solver = ds.ImplicitMidpoint()
+    options = dict(key=KEY, sampling=ds.IndependentPaths(1000))
     kinked = lambda t, y, args: jnp.abs(y[1])
-    estimate = ds.expectation(kinked, terms, solver, 0, 2, 1.0, y0, **options)
-    assert np.isfinite(estimate.mean)
+    given = kinked, terms, ds.ImplicitMidpoint(), 0, 2, 1.0, y0
+    assert np.isfinite(ds.expectation(*given, **options).mean)
 
 
+@pytest.mark.filterwarnings("error")
 def test_a_law_that_changes_the_mean_is_told():
-    few = dict(sampling=ds.IndependentPaths(20_000), levels=1)
-    weak = walk(ds.WeakBrownianPath((), jr.key(0)))
+    def mean(path):
+        few = dict(key=KEY, sampling=ds.IndependentPaths(20_000), levels=1)
+        given = walk(path), ds.StormerVerlet(), 0, 1, 0.25, Y0
+        return ds.expectation(beyond, *given, **few)
+
     with pytest.warns(UserWarning, match="changes by up to .* with Gaussian"):
-        estimate = mean(beyond, weak, **few)
+        estimate = mean(ds.WeakBrownianPath((), jr.key(0)))
     # Four steps of three values each.
     assert abs(estimate.mean - ndtr(-0.5)) > 5 * estimate.std_error
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        mean(lambda t, y, args: y[0] ** 2, weak, **few)
-        gaussian = walk(ds.FixedStepBrownianPath((), jr.key(0)))
-        assert np.isfinite(mean(beyond, gaussian, **few).mean)
+    gaussian = mean(ds.FixedStepBrownianPath((), jr.key(0)))
+    assert abs(gaussian.mean - ndtr(-0.5)) < 4 * gaussian.std_error

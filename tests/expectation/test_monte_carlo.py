@@ -1,14 +1,7 @@
 """Expectations over many paths: the same paths however they are run, none lost, none
-counted that failed."""
+counted that failed, and as many as a tolerance needs."""
 
 import dataclasses
-import functools
-import os
-import socket
-import subprocess
-import sys
-import warnings
-from pathlib import Path
 
 import diffrax
 import equinox as eqx
@@ -21,8 +14,12 @@ import pytest
 
 import diffrax_symplectic as ds
 
-from ..picard import by_picard
-from ..problems import kubo_terms
+from ..problems import RecordingMeter
+from .cells import Cell, moment
+from .steps import sampled
+
+
+KEY = jr.key(2)
 
 
 def _normal(key):
@@ -35,10 +32,16 @@ def _by_hand(fn, key, n):
     return jax.jit(jax.vmap(of_path, (0, None)))(index, key)
 
 
-@pytest.mark.parametrize("batch_size", [7, 4096])
-def test_mean_and_standard_error_are_those_of_all_paths(batch_size):
+def test_mean_and_standard_error_are_those_of_all_paths():
+    traced = []
+
+    def fn(key):
+        traced.append(key)
+        return _normal(key)
+
     key = jr.key(1)
-    got = ds.monte_carlo(_normal, key=key, num_paths=1000, batch_size=batch_size)
+    got = ds.monte_carlo(fn, key=key, num_paths=1000, batch_size=7)
+    assert len(traced) == 1
     x = np.asarray(_by_hand(_normal, key, 1000)["x"])
     np.testing.assert_allclose(got.mean["x"], x.mean(axis=0), rtol=1e-14)
     # Small deviations about a large mean: a difference of squares would lose these.
@@ -48,49 +51,43 @@ def test_mean_and_standard_error_are_those_of_all_paths(batch_size):
     assert (got.num_paths, got.num_failed) == (1000, 0)
 
 
-def test_what_is_sampled_is_traced_once():
-    calls = []
+def test_single_precision_is_accumulated_in_double():
+    third = jnp.float32(1 / 3)
 
     def fn(key):
-        calls.append(key)
-        return jr.normal(key)
+        x = jr.normal(key, (), jnp.float32)
+        return {"ones": jnp.float32(1) + 1e-3 * x, "constant": third + 0 * x}
 
-    ds.monte_carlo(fn, key=jr.key(0), num_paths=1000, batch_size=100)
-    assert len(calls) == 1
-
-
-def test_single_precision_is_accumulated_in_double():
-    ones = lambda key: jnp.float32(1) + 1e-3 * jr.normal(key, (), jnp.float32)
-    got = ds.monte_carlo(ones, key=jr.key(0), num_paths=100_000, batch_size=1000)
-    x = np.asarray(_by_hand(ones, jr.key(0), 100_000), float)
-    np.testing.assert_allclose(got.mean, x.mean(), rtol=1e-8)
-    np.testing.assert_allclose(got.variance, x.var(ddof=1), rtol=1e-4)
-
-
-def test_the_mean_of_a_constant_in_single_precision_is_that_constant():
-    third = jnp.float32(1 / 3)
-    same = lambda key: third + 0 * jr.normal(key, (), "f4")
-    got = ds.monte_carlo(same, key=jr.key(0), num_paths=1023)
-    assert got.mean == np.float64(third)
+    got = ds.monte_carlo(fn, key=jr.key(0), num_paths=100_000, batch_size=1000)
+    x = np.asarray(_by_hand(fn, jr.key(0), 100_000)["ones"], float)
+    np.testing.assert_allclose(got.mean["ones"], x.mean(), rtol=1e-8)
+    np.testing.assert_allclose(got.variance["ones"], x.var(ddof=1), rtol=1e-4)
+    assert got.mean["constant"] == np.float64(third)
     # It is known no better than it is rounded.
-    np.testing.assert_allclose(got.std_error, np.finfo(np.float32).eps / 3)
+    rounding = np.finfo(np.float32).eps / 3
+    np.testing.assert_allclose(got.std_error["constant"], rounding)
 
 
 @pytest.mark.core
-def test_an_estimate_can_be_continued():
-    key = jr.key(2)
-    first = ds.monte_carlo(_normal, key=key, num_paths=300, batch_size=128)
-    rest = ds.monte_carlo(_normal, key=key, num_paths=1000, batch_size=200, start=first)
-    whole = ds.monte_carlo(_normal, key=key, num_paths=1000)
+def test_an_interrupt_loses_only_what_is_running_and_the_estimate_can_be_continued():
+    run = lambda num_paths, key=KEY, fn=_normal, **options: ds.monte_carlo(
+        fn, key=key, num_paths=num_paths, batch_size=100, **options
+    )
+    with pytest.raises(ds.ExpectationInterrupted) as info:
+        run(1000, progress_meter=RecordingMeter([], 2, KeyboardInterrupt))
+    first = info.value.estimate
+    assert first.num_paths == 300
+    rest = ds.monte_carlo(_normal, key=KEY, num_paths=1000, start=first)
+    whole = run(1000)
     assert rest.num_paths == 1000
     np.testing.assert_allclose(rest.mean["x"], whole.mean["x"], rtol=1e-14)
     np.testing.assert_allclose(rest.variance["x"], whole.variance["x"], rtol=1e-9)
     with pytest.raises(ValueError, match="another `key`"):
-        ds.monte_carlo(_normal, key=jr.key(3), num_paths=1000, start=first)
+        run(1000, jr.key(3), start=first)
     with pytest.raises(ValueError, match="which has 1000 already"):
-        ds.monte_carlo(_normal, key=key, num_paths=300, start=rest)
+        run(300, start=rest)
     with pytest.raises(ValueError, match="another `fn`"):
-        ds.monte_carlo(lambda k: jr.normal(k), key=key, num_paths=2000, start=rest)
+        run(2000, fn=lambda key: jr.normal(key), start=rest)
 
 
 def test_failed_paths_are_counted_and_left_out():
@@ -109,88 +106,57 @@ def test_failed_paths_are_counted_and_left_out():
     np.testing.assert_allclose(got.mean, good.mean(), rtol=1e-13)
 
 
-DECAY = diffrax.ODETerm(lambda t, y, args: -y)
-
-
 def test_failures_are_counted_if_they_are_reported_and_raised_if_they_are_thrown():
-    def fn(key, throw):
-        """A solve that stops after half of its steps."""
+    def fn(key):
+        """A solve that an event ends below 0.5, or a failure after five steps."""
         sol = diffrax.diffeqsolve(
-            DECAY,
+            diffrax.ODETerm(lambda t, y, args: -y),
             diffrax.Euler(),
             0.0,
-            1.0,
+            2.0,
             0.1,
-            jr.normal(key),
-            throw=throw,
+            jr.uniform(key),
+            event=diffrax.Event(lambda t, y, args, **kwargs: y < 0.5),
             max_steps=5,
+            throw=False,
         )
-        return sol.ys[-1], sol.result
+        return sol.ts[-1], sol.result
 
-    run = lambda throw: ds.monte_carlo(
-        lambda key: fn(key, throw), key=jr.key(0), num_paths=100
+    with pytest.warns(UserWarning, match="paths failed"):
+        got = ds.monte_carlo(fn, key=jr.key(0), num_paths=200)
+    starts = _by_hand(jr.uniform, jr.key(0), 200)
+    assert got.num_failed == np.sum(starts > 0.5 / 0.9**5) > 0
+    assert 0.1 < got.mean < 0.5
+    thrown = lambda key: eqx.error_if(jr.normal(key), True, "a failure")
+    with pytest.raises(RuntimeError, match="a failure"):
+        ds.monte_carlo(thrown, key=jr.key(0), num_paths=100)
+
+
+def _square(key):
+    """Of an oscillator with multiplicative noise after ten steps."""
+    path, steps = ds.WeakBrownianPath((), key), 10
+    terms = ds.hamiltonian_terms(
+        lambda t, p, q, args: (p**2 + q**2) / 2, lambda t, p, q, args: q**2 / 4, path
     )
-    with pytest.warns(UserWarning, match="100 paths failed"):
-        assert run(False).num_failed == 100
-    with pytest.raises(RuntimeError, match="max_steps"):
-        run(True)
-
-
-def _square(solver, steps=10):
-    def phi(key):
-        terms = kubo_terms(ds.WeakBrownianPath((), key))
-        y0 = (jnp.array(0.0), jnp.array(1.0))
-        sol = diffrax.diffeqsolve(
-            terms, solver, 0.0, 1.0, 1 / steps, y0, max_steps=steps, throw=False
-        )
-        return sol.ys[1][-1] ** 2, sol.result
-
-    return phi
+    y0 = (jnp.array(0.0), jnp.array(1.0))
+    sol = diffrax.diffeqsolve(
+        terms, ds.StormerVerlet(), 0.0, 1.0, 1 / steps, y0, max_steps=steps, throw=False
+    )
+    return sol.ys[1][-1] ** 2, sol.result
 
 
 @pytest.mark.core
 def test_the_estimate_of_a_solve_is_its_exact_expectation():
-    # A step turns by 2 atan((h + I) / 2): the moments of the method in closed form.
-    n, h = 10, 0.1
-    phi = _square(by_picard(ds.ImplicitMidpoint()), n)
-    got = ds.monte_carlo(phi, key=jr.key(0), num_paths=4_000)
-    increments = np.sqrt(3 * h) * np.array([-1, 0, 1])
-    twice = 4 * np.arctan((h + increments) / 2)
-    exact = (1 + (np.exp(1j * twice) @ np.array([1, 4, 1]) / 6) ** n).real / 2
+    got = ds.monte_carlo(_square, key=jr.key(0), num_paths=4_000)
+    cell = Cell("multiplicative", 0.5, 1.0, 10)
+    exact, exact_square = moment(cell, 2)[4], moment(cell, 4)[40]
     assert got.num_failed == 0
     assert abs(got.mean - exact) <= 4 * got.std_error
-    assert 0 < got.std_error < 0.01
+    std_error = np.sqrt((exact_square - exact**2) / 4_000)
+    assert got.std_error == pytest.approx(std_error, rel=0.1)
     # Where no path is left to solve it stays as it is.
-    same = ds.monte_carlo(phi, key=jr.key(0), num_paths=4_000, start=got)
+    same = ds.monte_carlo(_square, key=jr.key(0), num_paths=4_000, start=got)
     assert same.mean == got.mean
-
-
-def test_an_interrupt_loses_only_what_is_running():
-    class Interrupting(diffrax.AbstractProgressMeter):
-        def init(self):
-            return 0
-
-        def step(self, state, progress):
-            if state == 2:
-                raise KeyboardInterrupt
-            return state + 1
-
-        def close(self, state):
-            pass
-
-    with pytest.raises(ds.ExpectationInterrupted) as info:
-        ds.monte_carlo(
-            _normal,
-            key=jr.key(0),
-            num_paths=1000,
-            batch_size=100,
-            progress_meter=Interrupting(),
-        )
-    estimate = info.value.estimate
-    assert estimate.num_paths == 300
-    rest = ds.monte_carlo(_normal, key=jr.key(0), num_paths=1000, start=estimate)
-    whole = ds.monte_carlo(_normal, key=jr.key(0), num_paths=1000)
-    np.testing.assert_allclose(rest.mean["x"], whole.mean["x"], rtol=1e-14)
 
 
 @pytest.mark.parametrize("meter", ["TqdmProgressMeter", "TextProgressMeter"])
@@ -201,56 +167,6 @@ def test_meters_of_diffrax_take_expectations(meter, capfd):
     assert "100" in "".join(capfd.readouterr())
 
 
-@pytest.mark.parametrize("value", [0, -1, 1.5, "3", True])
-def test_sizes_that_are_not_positive_integers_are_refused(value):
-    with pytest.raises(ValueError, match="`batch_size` must be a positive integer"):
-        ds.monte_carlo(_normal, key=jr.key(0), num_paths=10, batch_size=value)
-    # One path alone says nothing of its error.
-    few = 1 if value is True else value
-    with pytest.raises(ValueError, match="`num_paths` must be an integer, 2 or larger"):
-        ds.monte_carlo(_normal, key=jr.key(0), num_paths=few)
-
-
-@pytest.mark.filterwarnings("error::RuntimeWarning")
-@pytest.mark.parametrize("size", [1e-200, 1e200])
-def test_values_whose_squares_underflow_or_overflow_are_as_good_as_others(size):
-    run = lambda size: ds.monte_carlo(
-        lambda key: size * jr.normal(key), key=jr.key(0), num_paths=100, batch_size=30
-    )
-    one, got = run(1.0), run(size)
-    np.testing.assert_allclose(got.mean, size * one.mean, rtol=1e-12)
-    np.testing.assert_allclose(got.std_error, size * one.std_error, rtol=1e-12)
-
-
-def test_values_whose_spread_overflows_are_told():
-    huge = lambda key: 1e308 * jr.rademacher(key, dtype=float)
-    with pytest.warns(UserWarning, match="or its standard error is not finite"):
-        ds.monte_carlo(huge, key=jr.key(0), num_paths=100)
-
-
-def test_complex_values_and_functions_that_return_nothing_are_refused():
-    for fn, said in ((lambda key: jr.normal(key) * 1j, ""), (lambda key: None, "none")):
-        with pytest.raises(ValueError, match=f"`fn` must return real arrays.*{said}"):
-            ds.monte_carlo(fn, key=jr.key(0), num_paths=10)
-
-
-def test_functions_that_ignore_their_key_are_told():
-    with pytest.warns(UserWarning, match="All 10 samples are equal.* on its key"):
-        ds.monte_carlo(lambda key: jr.normal(jr.key(1)), key=jr.key(0), num_paths=10)
-
-
-def test_an_estimate_prints_every_number_of_the_mean_in_a_line_with_its_place():
-    ones = lambda key: jnp.ones((5, 6)) + 0 * jr.normal(key)
-    got = ds.monte_carlo(
-        lambda key: {"a": ones(key), "b": 2.0}, key=jr.key(0), num_paths=10
-    )
-    lines = str(got).splitlines()
-    assert lines[0] == "['a'][0, 0]: 1.000000000000000 ± 2.2e-16"
-    assert lines[29] == "['a'][4, 5]: 1.000000000000000 ± 2.2e-16"
-    assert lines[30] == "['b']: 2.000000000000000 ± 4.4e-16"
-    assert len(lines) == 33 and "10 paths on 1 level, 0 failed" in lines[-1]
-
-
 def test_old_style_keys_will_do():
     a = ds.monte_carlo(_normal, key=jr.PRNGKey(1), num_paths=100)
     np.testing.assert_array_equal(
@@ -258,86 +174,12 @@ def test_old_style_keys_will_do():
     )
 
 
-PROGRAM = """
-import sys
-import jax
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
-if len(sys.argv) > 2:
-    address, rank = sys.argv[2:]
-    jax.distributed.initialize(address, num_processes=2, process_id=int(rank))
-    jax.config.update("jax_cpu_collectives_implementation", "gloo")
-import jax.random as jr
-import diffrax_symplectic as ds
-from tests.expectation.test_monte_carlo import _square
-assert len(jax.devices()) == int(sys.argv[1]) * (2 if len(sys.argv) > 2 else 1)
-square = _square(ds.ImplicitMidpoint())
-e = ds.monte_carlo(square, key=jr.key(0), num_paths=3001, batch_size=100)
-numbers = [float(e.mean), float(e.std_error), e.num_paths]
-if len(sys.argv) == 2:
-    import diffrax
-    from tests.expectation.test_monte_carlo import _gradient
-    try:
-        got = ds.monte_carlo(_gradient(), key=jr.key(0), num_paths=100)
-    except ValueError as error:
-        said = "does not work on several devices. Pass `adjoint="
-        assert any(said in note for note in error.__notes__), error.__notes__
-        direct = _gradient(diffrax.DirectAdjoint())
-        got = ds.monte_carlo(direct, key=jr.key(0), num_paths=100)
-    numbers.append(float(got.mean))
-print(*map(repr, numbers))
-"""
-
-
-def _start(program: str, *args) -> subprocess.Popen:
-    root = str(Path(__file__).parents[2])
-    command = [sys.executable, "-c", program, *map(str, args)]
-    environment = os.environ | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": root}
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, text=True, env=environment, cwd=root
-    )
-
-
-def _read(process: subprocess.Popen) -> list[float]:
-    out, _ = process.communicate(timeout=300)
-    assert process.returncode == 0
-    return [float(x) for x in out.splitlines()[-1].split()]
-
-
-@functools.cache
-def _of_three_devices() -> list[float]:
-    """Three devices of one process: an estimate, its error and paths, and a gradient."""
-    return _read(_start(PROGRAM, 3))
-
-
-@pytest.mark.slow
-def test_the_paths_are_the_same_on_any_devices_and_hosts():
-    with socket.socket() as s:
-        s.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{s.getsockname()[1]}"
-    here = ds.monte_carlo(_square(ds.ImplicitMidpoint()), key=jr.key(0), num_paths=3001)
-    expected = [here.mean, here.std_error, here.num_paths]
-    np.testing.assert_allclose(_of_three_devices()[:3], expected, rtol=1e-12)
-    # Two processes with two devices each.
-    processes = [_start(PROGRAM, 2, address, rank) for rank in (0, 1)]
-    for process in processes:
-        np.testing.assert_allclose(_read(process), expected, rtol=1e-12)
-
-
-def test_results_within_phi_are_refused():
-    of_solve = lambda key: (jr.normal(key), jr.normal(key), diffrax.RESULTS.successful)
-    of_root = lambda key: (jr.normal(key), optx.RESULTS.successful)
-    for wrong in (of_solve, of_root):
-        with pytest.raises(ValueError, match=r"Return a pair `\(phi, sol.result\)`"):
-            ds.monte_carlo(wrong, key=jr.key(0), num_paths=10)
-
-
 def test_without_any_success_there_is_no_mean_and_it_can_go_on():
+    nan = lambda key: jnp.nan * jr.normal(key)
     with pytest.warns(UserWarning, match="10 paths failed: there is no mean"):
-        nothing = ds.monte_carlo(
-            lambda key: jnp.nan * jr.normal(key), key=jr.key(0), num_paths=10
-        )
+        nothing = ds.monte_carlo(nan, key=jr.key(0), num_paths=10, tol=1.0)
     assert (nothing.num_paths, nothing.num_failed) == (0, 10)
+    assert nothing.tol_reached is False
     numbers = nothing.mean, nothing.std_error, nothing.failed_error
     assert np.all(np.isnan(numbers)) and "could change" not in str(nothing)
     # As in a file of an earlier version, which does not know its function.
@@ -350,79 +192,16 @@ def test_without_any_success_there_is_no_mean_and_it_can_go_on():
         ds.monte_carlo(
             lambda k: jr.normal(k, (2,)), key=jr.key(0), num_paths=30, start=nothing
         )
-    with pytest.raises(ValueError, match="needs a random key"):
-        ds.monte_carlo(jr.normal, key=0, num_paths=10)
-
-
-def test_paths_that_an_event_ends_are_no_failures():
-    def fn(key):
-        event = diffrax.Event(lambda t, y, args, **kwargs: y < 0.5)
-        sol = diffrax.diffeqsolve(
-            DECAY,
-            diffrax.Euler(),
-            0.0,
-            2.0,
-            0.1,
-            jr.uniform(key),
-            event=event,
-            throw=False,
-        )
-        return sol.ts[-1], sol.result
-
-    got = ds.monte_carlo(fn, key=jr.key(0), num_paths=200)
-    assert got.num_failed == 0 and 0.1 < got.mean < 2
-
-
-def _gradient(adjoint=None):
-    if adjoint is None:
-        adjoint = diffrax.RecursiveCheckpointAdjoint()
-
-    def observable(strength, key):
-        H0 = lambda t, p, q, args: p**2 / 2 - jnp.cos(q)
-        noise = lambda t, p, q, args: strength * jnp.sin(q)
-        terms = ds.hamiltonian_terms(H0, noise, ds.WeakBrownianPath((), key))
-        y0, solver = (jnp.array(0.0), jnp.array(1.0)), ds.StormerVerlet()
-        sol = diffrax.diffeqsolve(terms, solver, 0.0, 0.5, 0.1, y0, adjoint=adjoint)
-        return sol.ys[1][-1]
-
-    return jax.tree_util.Partial(jax.grad(observable), jnp.array(0.5))
-
-
-@functools.cache
-def _mean_gradient() -> float:
-    by_hand = jax.jit(lambda key: _by_hand(_gradient(), key, 100))
-    return np.mean(by_hand(jr.key(0)))
-
-
-@pytest.mark.slow
-def test_gradients_are_taken_within():
-    one = jax.devices()[:1]
-    got = ds.monte_carlo(_gradient(), key=jr.key(0), num_paths=100, devices=one)
-    np.testing.assert_allclose(got.mean, _mean_gradient(), rtol=1e-12)
-
-
-@pytest.mark.slow
-def test_gradients_are_taken_within_on_several_devices():
-    # The default adjoint is refused from JAX 0.10 on, and that of the advice works.
-    np.testing.assert_allclose(_of_three_devices()[3], _mean_gradient(), rtol=1e-12)
 
 
 def test_newtons_method_takes_part_from_the_first_batch_that_needs_it():
     # Sweeps solve no step in which an oscillator turns by 40.
     stiff = lambda t, p, q, args: (p**2 + 400 * q**2) / 2
     terms = ds.hamiltonian_terms(stiff, lambda t, p, q, args: -q, ())
+    given = terms, ds.ImplicitMidpoint(), 2.0, (jnp.array(0.0), jnp.array(1.0))
+    square = lambda t, y, args: y[0] ** 2
     few = ds.IndependentPaths(256, batch_size=64)
-
-    def estimate(root_finder):
-        solver = ds.ImplicitMidpoint(root_finder=root_finder)
-        y0 = jnp.array(0.0), jnp.array(1.0)
-        given = lambda t, y, args: y[0] ** 2, terms, solver, 0, 4, 2.0, y0
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "256 paths failed")
-            return ds.expectation(*given, key=jr.key(2), sampling=few, levels=1)
-
-    assert estimate(ds.PicardNewton(newton_steps=0)).num_failed > 200
-    got = estimate(ds.PicardNewton())
+    got = sampled(few, *given, num_steps=2, levels=1, phi=square, key=KEY)
     assert got.num_failed == 0 and got.num_paths == 256
     # Two steps of the midpoint rule, (1 - A) y1 = (1 + A) y0 + (W, 0).
     A = np.array([[0.0, -400.0], [1.0, 0.0]])
@@ -445,3 +224,153 @@ class _Steps(eqx.Module):
 def test_a_solver_in_a_function_of_the_user_keeps_newtons_method():
     got = ds.monte_carlo(_Steps(ds.ImplicitMidpoint()), key=jr.key(0), num_paths=64)
     assert got.mean > 90
+
+
+def _number(key):
+    """Which word the key has: no two paths share it."""
+    return jr.bits(key, (), jnp.uint32).astype(float)
+
+
+def test_keys_of_paths_beyond_32_bits_carry_into_the_second_word():
+    key, n, first = jr.key(7), 10, 2**33 - 4
+    got = ds.monte_carlo(_number, key=key, num_paths=n, batch_size=n, first=first)
+    words = [divmod(i, 2**32) for i in range(first, first + n)]
+    keys = [jr.fold_in(jr.fold_in(key, hi), np.uint32(lo)) for hi, lo in words]
+    x = np.array([_number(k) for k in keys])
+    assert {hi for hi, _ in words} == {1, 2}
+    assert (got.num_paths, got.num_failed) == (n, 0)
+    np.testing.assert_allclose(got.mean, x.mean(), rtol=1e-14)
+    np.testing.assert_allclose(got.variance, x.var(ddof=1), rtol=1e-12)
+
+
+def test_progress_is_shown_after_each_batch_and_closed_in_any_case():
+    calls = []
+    run = lambda meter: ds.monte_carlo(
+        jr.normal, key=jr.key(0), num_paths=10, batch_size=4, progress_meter=meter
+    )
+    run(RecordingMeter(calls))
+    assert calls == ["init", 0.4, 0.8, 1.0, ("closed after", 3)]
+    calls.clear()
+    with pytest.raises(RuntimeError, match="stop here"):
+        run(RecordingMeter(calls, fails_at=1))
+    assert calls == ["init", 0.4, 0.8, ("closed after", 1)]
+
+
+def test_paths_are_added_until_every_standard_error_is_below_tol():
+    def two(key):
+        x = jr.normal(key, (2,))
+        return {"small": 1e-3 * x[0], "large": x}
+
+    run = lambda n, **kwargs: ds.monte_carlo(
+        two, key=jr.key(3), num_paths=n, batch_size=500, **kwargs
+    )
+    tol = 0.02
+    got = run(100_000, tol=tol)
+    # 2,500 paths are about enough for a deviation of 1; one batch more is under way.
+    assert 2_000 <= got.num_paths <= 4_000 and got.num_paths % 500 == 0
+    assert got.tol_reached and np.all(got.std_error["large"] <= tol)
+    before = run(got.num_paths - 1_000)
+    assert before.tol_reached is None and np.any(before.std_error["large"] > tol)
+    whole = run(got.num_paths)
+    np.testing.assert_array_equal(got.mean["large"], whole.mean["large"])
+    with pytest.warns(
+        UserWarning, match="`tol=0.02` was not reached: .* 1,000 p"
+    ) as told:
+        short = run(1_000, tol=tol)
+    needed = 1_000 * (np.max(short.std_error["large"]) / tol) ** 2
+    assert f"takes about {needed:.1e} paths" in str(told[0].message)
+    assert short.tol_reached is False and "`tol` was not reached" in str(short)
+    assert short.num_paths == 1_000
+    # It goes on from there, and not at all where nothing is left to do.
+    on = run(100_000, tol=tol, start=short)
+    assert on.tol_reached and on.num_paths == got.num_paths
+    assert run(100_000, tol=tol, start=on).num_paths == on.num_paths
+
+
+def test_levels_of_a_sample_share_its_key_and_go_on_where_they_stopped():
+    def fn(key, level):
+        return (1 + 0.1 * 0.5**level) * jr.normal(key)
+
+    run = lambda n, start=None: ds.monte_carlo(
+        fn, key=jr.key(0), num_paths=n, levels=2, order=1, start=start
+    )
+    got = run(1000)
+    one = ds.monte_carlo(jr.normal, key=jr.key(0), num_paths=1000)
+    np.testing.assert_allclose(got.mean, one.mean, rtol=1e-12)
+    # The mean of the finer level less the extrapolated one.
+    np.testing.assert_allclose(got.bias, 0.05 * one.mean, rtol=1e-12)
+    np.testing.assert_allclose(got.bias_std_error, 0.05 * one.std_error, rtol=1e-12)
+    np.testing.assert_allclose(got.error, np.hypot(got.std_error, got.bias))
+    parts = (
+        f"sampling {got.std_error:.1e}, discretization {got.discretization_error:.1e}"
+    )
+    assert f"± {got.error:.1e} ({parts})" in str(got)
+    low, high = got.interval(0.5)
+    assert high - low > got.error
+    rest = run(1000, start=run(300))
+    np.testing.assert_allclose(rest.mean, got.mean, rtol=1e-12)
+    np.testing.assert_allclose(rest.bias, got.bias, rtol=1e-11)
+    assert one.bias is None and one.bias_std_error is None
+    np.testing.assert_array_equal(one.error, one.std_error)
+
+
+def test_a_path_fails_if_it_does_on_one_of_the_levels():
+    def phi(key, level):
+        x = jr.uniform(key)
+        return jnp.where((level == 1) & (x < 0.5), jnp.nan, x * (1 + level))
+
+    got = ds.monte_carlo(phi, key=jr.key(1), num_paths=64, levels=2, order=2)
+    x = np.array(
+        [jr.uniform(jr.fold_in(jr.fold_in(jr.key(1), 0), i)) for i in range(64)]
+    )
+    assert got.num_failed == np.sum(x < 0.5) and got.num_paths == np.sum(x >= 0.5)
+    # 4/3 of the finer level less 1/3 of the coarser one.
+    np.testing.assert_allclose(got.mean, np.mean(x[x >= 0.5]) * 7 / 3, rtol=1e-12)
+
+
+def test_an_order_of_one_half_removes_powers_of_the_root_of_the_step():
+    def phi(key, level):
+        h = 0.5**level
+        return jr.uniform(key) + 3 * jnp.sqrt(h) - 2 * h
+
+    got = ds.monte_carlo(phi, key=jr.key(1), num_paths=64, levels=3, order=0.5)
+    exact = ds.monte_carlo(jr.uniform, key=jr.key(1), num_paths=64)
+    np.testing.assert_allclose(got.mean, exact.mean, rtol=1e-12)
+    np.testing.assert_allclose(got.bias, 3 * 0.5 - 2 * 0.25, rtol=1e-12)
+
+
+SUCCESS = diffrax.RESULTS.successful
+
+
+@pytest.mark.parametrize(
+    "message, changes",
+    [
+        ("`batch_size` must be a positive integer", dict(batch_size=0)),
+        ("`batch_size` must be a positive integer", dict(batch_size=1.5)),
+        ("`batch_size` must be a positive integer", dict(batch_size="3")),
+        ("`batch_size` must be a positive integer", dict(batch_size=True)),
+        # One path alone says nothing of its error.
+        ("`num_paths` must be an integer, 2 or larger", dict(num_paths=1)),
+        ("`num_paths` must be an integer, 2 or larger", dict(num_paths=2.5)),
+        ("`tol` must be a positive number", dict(tol=0.0)),
+        ("`tol` must be a positive number", dict(tol=float("nan"))),
+        ("the weak order of the solver", dict(levels=2)),
+        ("`order` must be a positive integer", dict(levels=2, order=0)),
+        ("`order` must be a positive integer, or 1/2", dict(levels=2, order=1.5)),
+        ("needs a random key", dict(key=0)),
+        ("`fn` must return real arrays", dict(fn=lambda key: jr.normal(key) * 1j)),
+        ("`fn` must return real arrays.*none", dict(fn=lambda key: None)),
+        (
+            r"Return a pair `\(phi, sol.result\)`",
+            dict(fn=lambda key: (1.0, 1.0, SUCCESS)),
+        ),
+        (
+            r"Return a pair `\(phi, sol.result\)`",
+            dict(fn=lambda key: (1.0, optx.RESULTS.successful)),
+        ),
+    ],
+)
+def test_bad_input_is_told_what_to_pass(message, changes):
+    given = dict(fn=jr.normal, key=jr.key(0), num_paths=10) | changes
+    with pytest.raises(ValueError, match=message):
+        ds.monte_carlo(**given)

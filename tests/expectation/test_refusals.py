@@ -11,11 +11,12 @@ import pytest
 
 import diffrax_symplectic as ds
 from diffrax_symplectic._brownian import is_random
-from diffrax_symplectic._terms import path_keys, with_keys
+from diffrax_symplectic._terms import brownian_paths, path_keys, with_keys
 
 from ..drjit_here import needs_drjit
-from ..picard import by_picard
 from ..solver.test_times_and_paths import RECORD
+from .cells import Cell, moment
+from .steps import problem_of
 
 
 def H0(t, p, q, args):
@@ -25,13 +26,10 @@ def H0(t, p, q, args):
 Y0 = jnp.zeros(()), jnp.ones(())
 
 
-def _mean(path, sampling=None, y0=Y0, t0=0.0, t1=1.0, dt0=0.1, **others):
+def _mean(path, sampling=None, **others):
     terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: 0.1 * q, path)
-    phi = lambda t, y, args: y[1] ** 2
-    return ds.expectation(
-        phi, terms, ds.StormerVerlet(), t0, t1, dt0, y0, key=jr.key(0),
-        sampling=sampling, **others,
-    )  # fmt: skip
+    given = lambda t, y, args: y[1] ** 2, terms, ds.StormerVerlet(), 0.0, 1.0, 0.1, Y0
+    return ds.expectation(*given, key=jr.key(0), sampling=sampling, **others)
 
 
 @pytest.mark.parametrize(
@@ -42,7 +40,7 @@ def test_recorded_noise_has_no_mean(sampling):
         _mean(RECORD, sampling)
 
 
-class Kicks(diffrax.AbstractBrownianPath):
+class OwnPath(diffrax.AbstractBrownianPath):
     """A path of a user's own that draws its noise."""
 
     key: jax.Array
@@ -56,17 +54,15 @@ class Kicks(diffrax.AbstractBrownianPath):
 
 
 def test_random_noise_of_a_path_of_ones_own_has_one():
-    several = ds.IndependentPaths(4000)
-    estimate = _mean(Kicks(jr.key(0)), several, levels=1)
-    theirs = _mean(ds.FixedStepBrownianPath((), jr.key(0)), several, levels=1)
-    error = np.hypot(estimate.std_error, theirs.std_error)
-    assert 0 < estimate.std_error and abs(estimate.mean - theirs.mean) <= 4 * error
+    estimate = _mean(OwnPath(jr.key(0)), ds.IndependentPaths(4000), levels=1)
+    exact = moment(Cell("additive", 0.1, 1.0, 10), 2)[4]
+    assert 0 < abs(estimate.mean - exact) <= 4 * estimate.std_error
 
 
 def test_only_the_key_of_a_path_is_replaced():
     key, old, table = jr.key(0), jr.PRNGKey(0), jnp.arange(5, dtype=jnp.uint32)
-    path = Kicks((key, {"table": table, "old": old}))
-    assert not is_random(Kicks(table)) and is_random(Kicks(old))
+    path = OwnPath((key, {"table": table, "old": old}))
+    assert not is_random(OwnPath(table)) and is_random(OwnPath(old))
     new = with_keys(path, path_keys(path, jr.key(1))).key
     assert new[1]["table"] is table
     np.testing.assert_array_equal(jr.key_data(new[0]), new[1]["old"])
@@ -87,15 +83,13 @@ def test_a_control_term_may_have_the_shape_of_its_path():
     field = lambda t, y, args: jnp.array([[1.0, 2.0, 2.0]])
     drift = diffrax.ODETerm(lambda t, y, args: -y)
     terms_with = lambda path: diffrax.MultiTerm(drift, diffrax.ControlTerm(field, path))
-    mean = lambda path: ds.expectation(
-        lambda t, y, args: y[0] ** 2, terms_with(path), by_picard(ds.SRKw5()), 0, 1, 0.5,
-        jnp.zeros(1), key=jr.key(0), sampling=ds.IndependentPaths(16), levels=1,
-    )  # fmt: skip
-    assert mean((3,)).std_error > 0
+    problem = problem_of(terms_with((3,)), ds.SRKw5(), 0.5, jnp.zeros(1))
+    (path,) = brownian_paths(problem.terms)
+    assert path.shape == jax.ShapeDtypeStruct((3,), jnp.float64)
     suggestions = ds.suggest_solver(terms_with((3,)), 0.0, jnp.zeros(1), want="weak")
     assert suggestions[0].solver == ds.AdditiveGauss()
     with pytest.raises(ValueError, match="or its shape `.m,.`; got a list"):
-        mean([3])
+        problem_of(terms_with([3]), ds.SRKw5(), 0.5, jnp.zeros(1))
 
 
 def _spring(size):
@@ -120,10 +114,8 @@ def _compared(terms, solver, t0, t1, dt0, y0, **others):
 _mean_of_q = ft.partial(ds.expectation, lambda t, y, args: y[1])
 _fits = ds.ValueFunctions(degree=2, num_paths=8)
 CLOSURES = {
-    "monte_carlo": lambda size: (
-        ds.monte_carlo(
-            lambda key: size * jr.normal(key), key=jr.key(0), num_paths=2
-        ).mean
+    "monte_carlo": lambda size: ds.monte_carlo(
+        lambda key: size * jr.normal(key), key=jr.key(0), num_paths=2
     ),
     "IndependentPaths": _of_system(_mean_of_q, sampling=ds.IndependentPaths(8)),
     "ValueFunctions": pytest.param(
@@ -151,29 +143,24 @@ def test_steps_that_single_precision_does_not_resolve_are_refused_at_once():
     single = jax.ShapeDtypeStruct((), jnp.float32)
     path = ds.WeakBrownianPath(single, jr.key(0))
     y0 = jnp.zeros((), jnp.float32), jnp.ones((), jnp.float32)
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: 0.1 * q, path)
+    given = terms, ds.StormerVerlet(), 0.1, y0
     with pytest.raises(ValueError, match="100 times the rounding.*float32"):
-        _mean(path, y0=y0, t0=1e6, t1=1e6 + 1)
-    _mean(path, ds.IndependentPaths(10), y0=y0, t0=100.0, t1=101.0, levels=1)
+        problem_of(*given, t0=1e6)
+    problem_of(*given, t0=100.0)
 
 
 def test_a_function_of_spins_is_told_that_it_gets_a_pair():
-    terms = ds.spin_terms(
-        lambda t, s, args: s[2],
-        lambda t, s, args: 0.1 * s[0],
-        ds.WeakBrownianPath((), jr.key(0)),
-    )
+    path = ds.WeakBrownianPath((), jr.key(0))
+    terms = ds.spin_terms(lambda t, s, args: s[2], lambda t, s, args: 0.1 * s[0], path)
     y0 = ds.to_spinors(jnp.array([0.6, 0.0, 0.8]))
     mean = lambda phi: ds.expectation(
         phi, terms, ds.ImplicitMidpoint(), 0.0, 0.2, 0.1, y0, key=jr.key(0),
         sampling=ds.IndependentPaths(10),
     )  # fmt: skip
-    for phi in (
-        lambda t, s, args: s[2],
-        lambda t, s, args: s[..., 2],
-        lambda t, s, args: s.sum(),
-    ):
+    for phi in (lambda s: s[2], lambda s: s[..., 2], lambda s: s.sum()):
         with pytest.raises(Exception, match=r"from_spinors\(y\)") as info:
-            mean(phi)
+            mean(lambda t, s, args: phi(s))
         assert not any("left out" in note for note in info.value.__notes__)
     # What was left out is still told.
     with pytest.raises(TypeError, match="Was it left out"):
