@@ -38,6 +38,7 @@ from ._compat import (
     evaluated,
     is_program,
     is_rule,
+    is_traced,
     Jaxpr,
     JaxprEqn,
     Literal,
@@ -553,12 +554,15 @@ def current_traces(fn: Callable) -> Iterator[None]:
         _calls.reset(token)
     new_calls = []
     for call in calls.values():
+        # A function that `fn` makes from values of its trace cannot be called after it, or
+        # returns what depends on them. It need not be watched, since each trace makes
+        # another one.
         try:
-            new_calls.append((call, traced(*call)))
+            program = traced(*call)
         except jax.errors.UnexpectedTracerError:
-            # A function that `fn` makes from values of its trace cannot be called after it.
-            # It need not be watched, since each trace makes another one.
             continue
+        if not any(map(is_traced, program.numbers)):
+            new_calls.append((call, program))
     _watched.put(key, _Watched(watched.number, [*watched.calls, *new_calls]))
 
 

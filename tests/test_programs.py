@@ -256,6 +256,22 @@ def test_traces_of_solves_are_used_again_while_their_functions_are_the_same():
     assert num_calls == 2
 
 
+def test_traces_of_solves_leave_out_functions_of_traced_values():
+    @ft.partial(jax.jit, static_argnums=1)
+    def inner(x, fn):
+        note_call(fn, x)
+        return fn(x)
+
+    def outer(spring, x):
+        return inner(x, lambda x: spring.k * x)
+
+    # The second time, the function of the first trace is not called again.
+    for k in (1.0, 3.0):
+        fn = jtu.Partial(outer, Spring(jnp.array(k)))
+        with current_traces(fn):
+            assert traced(fn, ONE)(2.0) == 2 * k
+
+
 def square(x):
     return x**2
 
