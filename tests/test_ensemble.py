@@ -295,7 +295,7 @@ BAD = [
     (dict(engine="cuda"), '`engine` must be "jax", "drjit" or `None`; got \'cuda\''),
     (dict(num_paths=0), "`num_paths` must be a positive integer"),
     (dict(batch_size=0), "`batch_size` must be a positive integer"),
-    (dict(dt0=0.3), "whole number of steps"),
+    (dict(dt0=0.3), "whole number of steps.* For example, `dt0=1 / 4`"),
     (dict(ts=[0.3]), "whole number of steps"),
     (dict(y0=(ONE[0], jnp.array(np.nan))), "`y0` must hold finite numbers"),
     (dict(solver=diffrax.EulerHeun), "`solver` must be a solver"),

@@ -123,8 +123,9 @@ def expectation(
     This function runs outside JAX transformations: it cannot be differentiated, `jit`ted or
     `vmap`ped. Each call traces the functions anew, so what they read is read anew, and
     compiles only if they compute something else than before: other numbers and arrays do
-    not count. For gradients, events and other options of `diffeqsolve`,
-    write a function of a key for [`diffrax_symplectic.monte_carlo`][].
+    not count, but for numbers like 1, 2 and 1/2 in a formula, and exponents. For gradients,
+    events and other options of `diffeqsolve`, write a function of a key for
+    [`diffrax_symplectic.monte_carlo`][].
 
     **Arguments:**
 
@@ -216,7 +217,8 @@ def expectation(
                 ft.partial(problem_of, levels), not has_shape, key, sampling, tol,
                 start, engine, devices,
             )  # fmt: skip
-            progress.stage(f"compiling and sampling with {levels} step sizes")
+            sizes = "one step size" if levels == 1 else f"{levels} step sizes"
+            progress.stage(f"compiling and sampling with {sizes}")
             estimate = run(
                 plan, key, devices, start, first, tol, progress, kept,
                 sampling=used_sampling,

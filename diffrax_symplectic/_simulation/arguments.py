@@ -98,10 +98,14 @@ def step_numbers(
     roundings = _TIME_ROUNDING * np.maximum(counts, 1)
     # Not `np.any(... > roundings)`, which is false for times that are NaN.
     if not np.all(np.abs(quotients - counts) <= roundings):
+        example = ""
+        if np.all(times == end):
+            num_steps = max(1, np.ceil(quotients[-1]))
+            example = f" For example, `dt0={end - begin:g} / {num_steps:.0f}`."
         raise ValueError(
             "Choose a `dt0` that divides the intervals between `t0`, `t1` and `ts`: `t1` "
             "and each of `ts` must be a whole number of steps after `t0`. Got "
-            f"dt0={step}, t0={begin}, t1={end} and ts={brief(times)}."
+            f"dt0={step}, t0={begin}, t1={end} and ts={brief(times)}.{example}"
         )
     if len(times) == 0 or np.any(counts < 0) or np.any(counts > counts[-1]):
         raise ValueError(

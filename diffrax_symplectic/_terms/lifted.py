@@ -95,7 +95,8 @@ def damping_for(
     if alpha.shape not in ((), shape):
         raise ValueError(
             f"`damping` must be a number, or have one for {each}, of shape {shape}; got "
-            f"shape {alpha.shape}."
+            f"shape {alpha.shape}. (Terms take `(H0, noise, path, damping=alpha)`. The "
+            "temperature enters by the noise.)"
         )
     # Traced values cannot raise an error; NaN makes their path fail.
     return jnp.where(jnp.isfinite(alpha) & (alpha >= 0), alpha, jnp.nan)

@@ -40,8 +40,12 @@ def as_path(path: Any) -> diffrax.AbstractBrownianPath:
     are_structs = all(isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves)
     if is_tuple or (len(leaves) > 0 and are_structs):
         return UnspecifiedPath(shape=checked_shape(path, "path"))
-    is_class = isinstance(path, type)
-    got = f"the class {path.__name__}" if is_class else f"a {type(path).__name__}"
+    if isinstance(path, type):
+        got = f"the class {path.__name__}"
+    elif isinstance(path, int):
+        got = f"{path}, for which write `({path},)`"
+    else:
+        got = f"a {type(path).__name__}"
     raise ValueError(
         "`path` must be a Brownian path, for example `solver.path((m,), key)`, or its "
         f"shape `(m,)`; got {got}. (For a system without noise pass neither `noise` nor "

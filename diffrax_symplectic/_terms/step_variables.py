@@ -69,8 +69,8 @@ def step_variables(
             "`terms` must hold Brownian paths whose laws are known, a `WeakBrownianPath` "
             "or a Gaussian path with `levy_area=BrownianIncrement`, `SpaceTimeLevyArea` or "
             "`SpaceTimeTimeLevyArea`, also within a `PlateauBrownianPath`; got "
-            f"{names}. (For a system without noise, pass a noise that is zero, such as "
-            "`0 * q`.)"
+            f"{names}. Pass `WeakBrownianPath(shape, key)`. (For a system without noise, "
+            "pass a noise that is zero, such as `0 * q`.)"
         )
     if numbers is None:
         # It is not known which paths with traced keys are the same.

@@ -226,6 +226,8 @@ def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
         ((None, T, (3,)), "`friction` must be a number"),
         ((jnp.ones(2), T, (3,)), r"and the momenta, \(3,\).*got shape \(2,\)"),
         ((jnp.eye(3), T, (3,)), r"Pass a matrix as `lineax.MatrixLinearOperator"),
+        ((jnp.eye(4), T, (4, 2)), r"For momenta of .* `lineax.PyTreeLinearOperator"),
+        ((jnp.ones((4, 1)), T, (2, 4)), r"got shape \(4, 1\)\.$"),
         ((as_friction(jnp.eye(4)), T, (2,)), r"\(2,\); got one for shape \(4,\)"),
         ((lx.MatrixLinearOperator(TENSOR), T, (3,)), "tagged as positive semidefinite"),
         (([1.0, 0, 1.0], T, (3,)), r"got \[1.0, 0, 1.0\]. .*`jnp.array\(friction\)`"),
@@ -235,7 +237,7 @@ def test_values_and_shapes_that_fit_nothing_are_refused_with_advice():
         ((1.0, -T, (3,)), "`temperature` must be a real number.*not negative"),
         ((1.0, lambda t: 1.0, (3,)), r"`temperature\(t, q, args\)`"),
         ((1.0, T), "both a `temperature` and a `path`"),
-        ((1.0, T, 3), "`path` must be a Brownian path"),
+        ((1.0, T, 3), r"`path` must be .*; got 3, for which write `\(3,\)`"),
         ((ds.FrictionAlong(lambda q: q), T, (3,)), r"`directions\(t, q, args\)`"),
     ):
         with pytest.raises(ValueError, match=match):

@@ -37,6 +37,11 @@ _PASS_MATRIX = (
     "a matrix as `lineax.MatrixLinearOperator(matrix, "
     "lineax.positive_semidefinite_tag)`"
 )
+_PASS_BLOCKS = (
+    "For momenta of shape `(n, d)` pass `lineax.PyTreeLinearOperator(array, "
+    "jax.eval_shape(lambda: q), lineax.positive_semidefinite_tag)` with an array of shape "
+    "`(n, d, n, d)`"
+)
 
 
 class FrictionAlong(AbstractCaller):
@@ -192,10 +197,8 @@ def _checked_matrix(
     if not _have_same_shapes(structure, momenta):
         raise ValueError(
             f"The operator of `friction` must act on arrays with the shape of {called}, "
-            f"{shapes(momenta)}; got one for shape {shapes(structure)}. For momenta of "
-            "shape `(n, d)` pass `lineax.PyTreeLinearOperator(array, jax.eval_shape("
-            "lambda: q), lineax.positive_semidefinite_tag)` with an array of shape "
-            "`(n, d, n, d)`."
+            f"{shapes(momenta)}; got one for shape {shapes(structure)}. "
+            f"{_PASS_BLOCKS}."
         )
     return friction.matrix if isinstance(friction, _Matrix) else friction.as_matrix()
 
@@ -246,8 +249,9 @@ def _checked_numbers(
         if len(momenta_shape) > 1 and shape == momenta_shape[:1]:
             axes = ", ".join([":"] + ["None"] * (len(momenta_shape) - 1))
             advice += f" For one number for each particle pass `{name}[{axes}]`."
-        if name == "friction" and len(shape) > 1:
-            advice += f" Pass {_PASS_MATRIX}."
+        if name == "friction" and len(shape) == 2 and shape[0] == shape[1]:
+            has_axes = len(momenta_shape) > 1
+            advice += f" {_PASS_BLOCKS}." if has_axes else f" Pass {_PASS_MATRIX}."
         raise ValueError(
             f"An array of `{name}` must have the shape of {called}, {momenta_shape}, in "
             "which any axis may have length one, or be a single number; got shape "
