@@ -73,16 +73,18 @@ SMOOTH = {
     "the mean of both sides at it": lambda t: jnp.where(t == 1, 2.5, _quench(t)),
 }
 
+QUENCHES = {"a quench": _quench, "a quench on a slope": lambda t: _quench(t) + 100 * t}
+
 
 def test_only_jumps_are_told():
     """One program for all of them, in which a number selects the function of time."""
 
     def H0(t, p, q, number):
-        functions = [*SMOOTH.values(), _quench]
+        functions = [*SMOOTH.values(), *QUENCHES.values()]
         stiffness = jax.lax.switch(number, functions, t)
         return jnp.sum(p**2) / 2 + stiffness * jnp.sum(q**2) / 2
 
-    for number, name in enumerate([*SMOOTH, "a quench"]):
+    for number, name in enumerate([*SMOOTH, *QUENCHES]):
         problem = problem_of(_bath(H0), BAOAB, 0.25, DISPLACED, jnp.array(number))
         assert jumps_within_steps(problem) is None, name
         assert (jumps_at_step_ends(problem) is None) == (name in SMOOTH), name
