@@ -79,6 +79,15 @@ def test_times_between_steps_are_told_in_few_words_with_the_advice_first():
     assert len(str(info.value)) < 200
 
 
+@pytest.mark.parametrize("cell, t0, levels", [(0.2, 0, 1), (0.1, 0, 2), (0.1, 0.05, 1)])
+def test_steps_of_a_path_with_cells_consist_of_whole_cells(cell, t0, levels):
+    path = ds.FixedStepBrownianPath((), jr.key(0), cell=cell)
+    terms = ds.hamiltonian_terms(H0, lambda t, p, q, args: 0.1 * q, path)
+    given = lambda t, y, args: y[1], terms, ds.StormerVerlet(), t0, t0 + 1, 0.1, Y0
+    with pytest.raises(ValueError, match="must begin and end at multiples of `cell`"):
+        ds.expectation(*given, key=jr.key(0), levels=levels)
+
+
 def test_a_control_term_may_have_the_shape_of_its_path():
     field = lambda t, y, args: jnp.array([[1.0, 2.0, 2.0]])
     drift = diffrax.ODETerm(lambda t, y, args: -y)
