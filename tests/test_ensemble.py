@@ -168,6 +168,21 @@ def test_an_error_within_a_step_is_raised():
         follow(terms, args=jnp.array(0.5), engine="drjit")
 
 
+@needs_drjit
+def test_a_window_of_a_table_is_moved_into_it_as_by_jax():
+    def tabulated(t, p, q, table):
+        place = jnp.floor(50 + 50 * q).astype(int)
+        window = jax.lax.dynamic_slice(table, (place,), (3,))
+        return p**2 / 2 + window @ jnp.stack([q, q**2, q**3]) / 50
+
+    table = jnp.linspace(1.0, 2.0, 100) ** 2
+    start = lambda key: (0 * ONE[0], jr.normal(key))
+    given = dict(terms=terms_of(tabulated), y0=start, args=table)
+    by_jax, fused = (follow(**given, engine=name).ys[1] for name in ("jax", "drjit"))
+    assert np.min(by_jax) < -1 and np.max(by_jax) > 1
+    np.testing.assert_allclose(fused, by_jax, rtol=1e-12)
+
+
 def ordered(t, p, q, args):
     return jnp.sum(p**2) / 2 + jnp.sort(jnp.tile(q, 6))[0] ** 2
 
