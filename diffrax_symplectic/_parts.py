@@ -22,11 +22,11 @@ def with_parts(
     kind: type[_T] | tuple[type[_T], ...], new_part: Callable[[_T], Any], tree: _Tree
 ) -> _Tree:
     """The PyTree with `new_part(part)` in place of each part of this class."""
+    is_part = ft.partial(_is_instance, kind)
 
     def replace(x: Any) -> Any:
         return new_part(x) if is_part(x) else x
 
-    is_part = ft.partial(_is_instance, kind)
     return jtu.tree_map(replace, tree, is_leaf=is_part)
 
 

@@ -194,13 +194,18 @@ def _with_sums_of_products(eqn: JaxprEqn) -> JaxprEqn:
     is_complex = any(jnp.issubdtype(x.dtype, jnp.complexfloating) for x in structs)
     if not is_complex or max(axes, default=0) > _LONGEST_AXIS:
         return eqn
-    sums = jax.jit(ft.partial(_sums_of_products, eqn.params["dimension_numbers"]))
+    [result] = eqn.outvars
+    dtype = _dtype_of(result.aval)
+    dimension_numbers = eqn.params["dimension_numbers"]
+    sums = jax.jit(ft.partial(_sums_of_products, dimension_numbers, dtype))
     [call] = jax.make_jaxpr(sums)(*structs).jaxpr.eqns
     return eqn.replace(primitive=call.primitive, params=call.params)
 
 
-def _sums_of_products(dimension_numbers: Any, left: Array, right: Array) -> Array:
-    """`jax.lax.dot_general`, entry by entry."""
+def _sums_of_products(
+    dimension_numbers: Any, dtype: Any, left: Array, right: Array
+) -> Array:
+    """`jax.lax.dot_general` with a result of this dtype, entry by entry."""
     (left_summed, right_summed), (left_batch, right_batch) = dimension_numbers
     num_batch = len(left_batch)
     num_summed = len(left_summed)
@@ -217,7 +222,8 @@ def _sums_of_products(dimension_numbers: Any, left: Array, right: Array) -> Arra
     num_right = right.ndim - num_batch - num_summed
     left = jnp.expand_dims(left, range(end_of_left, end_of_left + num_right))
     right = jnp.expand_dims(right, range(num_batch, end_of_left))
-    return jnp.sum(left * right, axis=tuple(range(-num_summed, 0)))
+    summed_axes = tuple(range(-num_summed, 0))
+    return jnp.sum(left.astype(dtype) * right, axis=summed_axes, dtype=dtype)
 
 
 def _numbers_apart(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:

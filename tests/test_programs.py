@@ -163,6 +163,13 @@ def test_products_of_small_complex_arrays_are_sums(subscripts):
     np.testing.assert_allclose(gradient, exact, rtol=1e-13, atol=1e-13)
 
 
+def test_a_product_may_have_more_digits_than_its_factors():
+    row = jnp.array([1, 1e-9], jnp.complex64)
+    product = ft.partial(jnp.dot, preferred_element_type=jnp.complex128)
+    found = traced(product, row, row[::-1])(row, jnp.ones_like(row))
+    assert found.dtype == jnp.complex128 and found.real > 1
+
+
 def test_products_of_large_or_real_arrays_are_left_to_xla():
     for matrix in (jnp.ones((2, 2)), jnp.ones((2, 9), complex)):
         program = traced(jnp.dot, matrix, matrix.T)

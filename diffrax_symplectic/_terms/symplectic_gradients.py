@@ -213,8 +213,8 @@ class HamiltonianNoise(AbstractNoise):
             if not same_structure or not jtu.tree_all(jtu.tree_map(fits, H, struct)):
                 raise ValueError(
                     "`noise` must return one Hamiltonian for each noise of the path, which "
-                    f"has shape {shapes(struct)}; got shape {shapes(H)}. Return the first, "
-                    "or make the path with the second one."
+                    f"has shape {shapes(struct)}; got shape {shapes(H)}. Return an "
+                    "array of the shape of the path, or make a path of the other shape."
                 )
             check_real_energies("noise", H)
             return jtu.tree_map(lambda leaf, s: jnp.reshape(leaf, s.shape), H, struct)
