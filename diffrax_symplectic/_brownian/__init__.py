@@ -1,3 +1,14 @@
+"""Random words, the laws of random variables, and Brownian paths.
+
+- `random`: random words for each step, and the laws of variables computed from them.
+- `stepwise`: paths whose increment over a step is a function of random words.
+- `cells`: steps composed of cells, so that different steps follow the same path.
+- `paths`: paths of independent random variables, discrete or Gaussian.
+- `wrappers`, `levy_area`: paths that change the increments of another path, or add
+  variables to them.
+- `variables`: facts about each random variable, and the path that has it.
+"""
+
 from .stepwise import AbstractStepwisePath, AbstractWrappedPath, GivenPath, Increment
 from .stepwise import (
     checked_shape,

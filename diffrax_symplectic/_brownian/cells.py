@@ -1,4 +1,9 @@
-"""Steps composed of cells, so that steps of different sizes follow the same path."""
+"""Steps composed of cells, so that steps of different sizes follow the same path.
+
+A cell is an interval of fixed length that starts at a multiple of this length. The path is
+drawn over each cell separately. Over a step it is composed of the paths over all cells in
+the step.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,12 +23,13 @@ from .._custom_types import RealScalarLike
 from .stepwise import Increment, step_size, zeros_and_unravel
 
 
-# The ends of a step may be this fraction of a cell away from multiples of the cell. Rounded
-# times are nearer, and steps that are no multiples rarely so near.
+# How far the ends of a step may be from multiples of the cell, as a fraction of the cell.
+# Rounding moves times by less. The ends of steps that do not consist of whole cells are
+# rarely so close to multiples.
 _CELL_TOLERANCE = 1e-3
 
 
-class Piece(eqx.Module):
+class Segment(eqx.Module):
     """A segment of a Brownian path of `m` noises.
 
     - `h`: its length.
@@ -38,33 +44,35 @@ class Piece(eqx.Module):
     A: Float[Array, "m m"] | None = None
 
     @staticmethod
-    def from_increment(increment: Increment, h: Float[Array, ""]) -> "Piece":
+    def from_increment(increment: Increment, h: Float[Array, ""]) -> "Segment":
         """The segment of length `h` with this increment."""
         assert isinstance(increment, diffrax.AbstractBrownianIncrement)
         W, _ = jfu.ravel_pytree(increment.W)
         h = h.astype(W.dtype)
         if not isinstance(increment, diffrax.AbstractSpaceTimeLevyArea):
-            return Piece(h, W)
+            return Segment(h, W)
         H, _ = jfu.ravel_pytree(increment.H)
-        return Piece(h, W, h * (W / 2 + H))
+        # This is the definition of `H`, solved for the integral.
+        return Segment(h, W, integral=h * (W / 2 + H))
 
     @property
     def H(self) -> Float[Array, " m"]:
         """The space-time Lévy area; zero for an empty segment."""
-        # A segment holds the integral, which composes by addition, and not the area.
+        # Segments hold the integral instead of the area, since integrals can be added.
         assert self.integral is not None
         return self.integral / positive_or_one(self.h) - self.W / 2
 
-    def followed_by(self, other: "Piece") -> "Piece":
+    def followed_by(self, other: "Segment") -> "Segment":
         """This segment followed by another, by Chen's rule."""
         integral = A = None
         if self.integral is not None and other.integral is not None:
-            # Over the other segment the path is above its start there by `self.W`.
+            # The other segment starts where this one ends. So relative to the start of this
+            # one, the path over the other segment is higher by `self.W`.
             integral = self.integral + other.integral + self.W * other.h
         if self.A is not None and other.A is not None:
             outer = jnp.outer(self.W, other.W)
             A = self.A + other.A + (outer - outer.T) / 2
-        return Piece(self.h + other.h, self.W + other.W, integral, A)
+        return Segment(self.h + other.h, self.W + other.W, integral, A)
 
     def as_increment(
         self,
@@ -73,8 +81,9 @@ class Piece(eqx.Module):
         h: RealScalarLike,
         use_levy: bool,
     ) -> Increment:
-        """The increment over a step of size `h` for a path of this shape. With `use_levy`
-        it is of type `increment_type`, with the areas of this segment."""
+        """Converts this segment to the value of a path over a step of size `h`: with
+        `use_levy` an object of type `increment_type` with the areas of the segment, and
+        otherwise `W` alone. Arrays get the structure and shapes of `shape`."""
         _, unravel = zeros_and_unravel(shape)
         if not use_levy:
             return unravel(self.W)
@@ -87,17 +96,17 @@ class Piece(eqx.Module):
 
 
 def positive_or_one(h: Float[Array, ""]) -> Float[Array, ""]:
-    """`h`, or 1 for an empty segment, as a divisor. In a batch, paths that have reached
-    their end take empty steps until all paths have."""
+    """The length `h` of a segment as a divisor: 1 for an empty segment. In a batch, paths
+    that have reached their end take empty steps until all paths have reached it."""
     return jnp.where(h > 0, h, 1)
 
 
 def checked_cell(cell: float | None) -> float | None:
-    """The length of a cell as a number of Python, or `None`. Raises a `ValueError` unless
-    it is positive, finite and not traced."""
+    """The length of a cell as a Python float, or `None` for a path without cells. Raises a
+    `ValueError` unless the length is positive, finite and not traced."""
     if cell is None:
         return None
-    # The cell is a static field of a path, so it must be known while tracing.
+    # Paths store the length as a static field, so its value must be known while tracing.
     is_known = eqx.is_array_like(cell) and not is_traced(cell)
     if not is_known or np.ndim(cell) != 0 or not 0 < float(cell) < np.inf:
         raise ValueError(
@@ -110,18 +119,18 @@ def compose(
     t0: RealScalarLike,
     t1: RealScalarLike,
     cell: float | Float[Array | np.ndarray, ""],
-    sample: Callable[[Int[Array, ""]], Piece],
+    sample: Callable[[Int[Array, ""]], Segment],
     path_name: str,
-) -> Piece:
-    """The segment from `t0` to `t1 >= t0`, composed of its cells: `sample(i)` is the one
-    that starts at `i * cell`. It is an error when run if the segment does not consist of
-    whole cells."""
+) -> Segment:
+    """The segment from `t0` to `t1 >= t0`, composed of its cells. `sample(i)` draws the
+    cell that starts at `i * cell`. If the segment does not consist of whole cells, this
+    raises an error when run, with the name `path_name` of the path's class."""
     first_cell = jnp.round(t0 / cell).astype(int)
     end_cell = jnp.round(t1 / cell).astype(int)
     distance_at_start = jnp.abs(first_cell * cell - t0)
     distance_at_end = jnp.abs(end_cell * cell - t1)
     distance = jnp.maximum(distance_at_start, distance_at_end)
-    # Times are sums of rounded steps, so they meet multiples of `cell` only nearly.
+    # Times are sums of rounded steps, so they are only close to multiples of `cell`.
     end_cell = eqx.error_if(
         end_cell,
         (distance > _CELL_TOLERANCE * cell) | (end_cell < first_cell),
@@ -130,9 +139,10 @@ def compose(
         "step with `diffrax.StepTo`.",
     )
     struct = jax.eval_shape(sample, first_cell)
-    empty_piece = jtu.tree_map(lambda leaf: lax.full_like(leaf, 0), struct)
+    # All fields of an empty segment are zero.
+    empty_segment = jtu.tree_map(lambda leaf: lax.full_like(leaf, 0), struct)
 
-    def extend(i: Int[Array, ""], piece: Piece) -> Piece:
-        return piece.followed_by(sample(i))
+    def extend(i: Int[Array, ""], segment: Segment) -> Segment:
+        return segment.followed_by(sample(i))
 
-    return lax.fori_loop(first_cell, end_cell, extend, empty_piece)
+    return lax.fori_loop(first_cell, end_cell, extend, empty_segment)

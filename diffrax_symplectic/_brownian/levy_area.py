@@ -1,3 +1,5 @@
+"""Lévy areas between noises, drawn from Fourier series of the Brownian path."""
+
 import dataclasses
 from typing import ClassVar
 
@@ -12,7 +14,7 @@ from .._arguments import whole_number
 from .._batch import materialize
 from .._custom_types import BM, RealScalarLike
 from .._products import dot
-from .cells import checked_cell, compose, Piece, positive_or_one
+from .cells import checked_cell, compose, positive_or_one, Segment
 from .random import AREA_WORDS, check_key, normal_from_words, place_of, random_words
 from .stepwise import AbstractWrappedPath, Increment, increment_struct, num_noises
 from .wrappers import check_space_time_area
@@ -33,7 +35,8 @@ class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):
     A: Float[Array, "m m"]
 
 
-# Matrix products over at most this many Fourier terms are written out.
+# A matrix product over at most this many Fourier terms is computed as a sum of outer
+# products.
 _MOST_UNROLLED = 4
 
 
@@ -98,30 +101,35 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         self.cell = checked_cell(cell)
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
-        def piece_between(t0: Array, t1: Array) -> Piece:
-            # The areas read each normal number several times, and XLA would compute it anew
-            # for each.
-            increment = materialize(lambda: self.path.evaluate(t0, t1, use_levy=True))
-            num_words = self.num_own_words(True)
-            words = random_words(self.key, place_of(t0, t1), 1, num_words, AREA_WORDS)
-            return self._piece_from_words(increment, words[0], t1 - t0)
-
         cell = self.cell
-        if cell is not None:
+        if cell is None and not use_levy:
+            # The increment alone is that of the wrapped path.
+            return self.path.evaluate(t0, t1)
+        if cell is None:
+            segment = self._drawn_segment(t0, t1)
+        else:
 
-            def sample(i: Array) -> Piece:
+            def sample(i: Array) -> Segment:
                 # Through rounding a cell may end just beyond the end of the path.
                 start = jnp.clip(i * cell, self.path.t0, self.path.t1)
                 end = jnp.clip((i + 1) * cell, self.path.t0, self.path.t1)
-                return piece_between(start, end)
+                return self._drawn_segment(start, end)
 
-            piece = compose(t0, t1, cell, sample, type(self).__name__)
-        elif use_levy:
-            piece = piece_between(t0, t1)
-        else:
-            # The increment alone needs none of the words drawn here.
-            return self.path.evaluate(t0, t1)
-        return self._as_increment(piece, t1 - t0, use_levy)
+            segment = compose(t0, t1, cell, sample, type(self).__name__)
+        shape = increment_struct(self.path)
+        return segment.as_increment(LevyAreaIncrement, shape, t1 - t0, use_levy)
+
+    def _drawn_segment(self, t0: Array, t1: Array) -> Segment:
+        """Draws the path and its areas from `t0` to `t1`, without dividing into cells."""
+        # The areas read each entry of `W` and `H` several times. XLA would compute it anew
+        # for each use.
+        increment = materialize(lambda: self.path.evaluate(t0, t1, use_levy=True))
+        place = place_of(t0, t1)
+        size = self.num_own_words(use_levy=True)
+        words = random_words(
+            self.key, place, num_sets=1, set_size=size, first_pair=AREA_WORDS
+        )
+        return self._segment_from_words(increment, words[0], t1 - t0)
 
     def num_own_words(self, use_levy: bool) -> int:
         if not use_levy:
@@ -130,46 +138,45 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         return sum(_group_sizes(m, self.num_terms))
 
     def own_increment(self, increment, own_words, h) -> Increment:
-        """The increment with areas, sampled over the step as a whole, regardless of
-        `cell`."""
+        """Adds areas to the increment of the wrapped path. Areas are sampled over the step
+        as a whole, even if this path has cells."""
+        # With `use_levy=False` an increment is `W` alone.
         if not isinstance(increment, diffrax.AbstractSpaceTimeLevyArea):
             return increment
-        piece = self._piece_from_words(increment, own_words, h)
-        return self._as_increment(piece, h, use_levy=True)
-
-    def _as_increment(
-        self, piece: Piece, h: RealScalarLike, use_levy: bool
-    ) -> Increment:
+        segment = self._segment_from_words(increment, own_words, h)
         shape = increment_struct(self.path)
-        return piece.as_increment(LevyAreaIncrement, shape, h, use_levy)
+        return segment.as_increment(LevyAreaIncrement, shape, h, use_levy=True)
 
-    def _piece_from_words(
+    def _segment_from_words(
         self, increment: Increment, words: UInt32[Array, " normals"], h: RealScalarLike
-    ) -> Piece:
-        """The path over a step of size `h` with this increment, with areas from `words`."""
+    ) -> Segment:
+        """The segment over a step of size `h` with this increment, and with areas that are
+        computed from `words`."""
         assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
         H, _ = jfu.ravel_pytree(increment.H)
-        piece = Piece.from_increment(increment, jnp.abs(h))
+        segment = Segment.from_increment(increment, jnp.abs(h))
         normals = normal_from_words(words, H.dtype)
-        # The bridge over a step is one over unit time, scaled by the root of the step size.
-        # Its areas are scaled by the step size.
-        unit_H = H / jnp.sqrt(positive_or_one(piece.h))
-        bridge_area = piece.h * _bridge_area(unit_H, normals, self.num_terms)
-        # The area between the line and the bridge, which only its integral enters.
-        outer = jnp.outer(H, piece.W)
-        return dataclasses.replace(piece, A=outer - outer.T + bridge_area)
+        # The Brownian path is a line plus a bridge. The bridge over a step of size `h` is a
+        # bridge over unit time, scaled by `sqrt(h)`. So its areas are scaled by `h`.
+        unit_H = H / jnp.sqrt(positive_or_one(segment.h))
+        bridge_area = segment.h * _bridge_area(unit_H, normals, self.num_terms)
+        # The areas between the line and the bridge depend only on `W` and `H`.
+        outer = jnp.outer(H, segment.W)
+        return dataclasses.replace(segment, A=outer - outer.T + bridge_area)
 
 
 def _group_sizes(m: int, num_terms: int) -> tuple[int, ...]:
-    """The numbers of independent standard normal variables for the areas of a bridge of `m`
-    noises, by their use:
+    """The sizes of the groups of independent standard normal variables from which the areas
+    of a bridge of `m` noises are computed. The remainder of a Fourier series are its terms
+    beyond the first `num_terms`. The groups give, in this order:
 
-    - for the Fourier coefficients of the cosines, one noise after another;
-    - for those of the sines;
-    - for the sum of the remaining cosine coefficients of each noise;
-    - for the part of the remainder's area that comes from the means of these coefficients,
-        for each noise;
-    - for the part that comes from their deviations, for each pair of noises.
+    - the first `num_terms` cosine coefficients of each noise;
+    - the first `num_terms` sine coefficients of each noise;
+    - the sum of the cosine coefficients in the remainder, for each noise;
+    - the area that comes from the means of the cosine coefficients in the remainder, for
+        each noise;
+    - the area that comes from the deviations of the cosine coefficients in the remainder
+        from their means, for each pair of noises.
     """
     return m * num_terms, m * num_terms, m, m, m * (m - 1) // 2
 
@@ -177,59 +184,66 @@ def _group_sizes(m: int, num_terms: int) -> tuple[int, ...]:
 def _bridge_area(
     H: Float[Array, " m"], normals: Float[Array, " normals"], num_terms: int
 ) -> Float[Array, "m m"]:
-    r"""The Lévy areas of a Brownian bridge over unit time with the integral `H`, from
-    independent standard normal numbers.
+    r"""The Lévy areas of a Brownian bridge over unit time whose integral is `H`, computed
+    from independent standard normal numbers, in groups as in `_group_sizes`.
 
     The bridge is $\sum_r a_r (\cos 2 \pi r t - 1) + b_r \sin 2 \pi r t$ with independent
-    coefficients of variance $s_r = 1 / (2 \pi^2 r^2)$, its integral $-\sum_r a_r$ and its
-    area $\pi \sum_r r (a_{kr} b_{lr} - b_{kr} a_{lr})$.
+    coefficients of variance $s_r = 1 / (2 \pi^2 r^2)$. Its integral is $-\sum_r a_r$. Its
+    area is $\pi \sum_r r (a_{kr} b_{lr} - b_{kr} a_{lr})$.
     """
     m = H.size
-    # NumPy computes these constants, so that the program does not.
-    orders = np.arange(1, num_terms + 1)
-    variances = 1 / (2 * np.pi**2 * orders**2)
-    # The sums of s_r and of s_r^2 over the terms of the remainder, r > num_terms: over all
-    # r they are 1/12 and 1/360. With many terms, rounding could make the second negative.
-    sum_beyond = 1 / 12 - np.sum(variances)
-    sum_of_squares_beyond = max(1 / 360 - np.sum(variances**2), 0)
-    deviations = jnp.asarray(np.sqrt(variances), H.dtype)
     ends_of_groups = np.cumsum(_group_sizes(m, num_terms))
     groups = jnp.split(normals, ends_of_groups[:-1])
     cosines, sines, remainder_sums, mean_parts, deviation_parts = groups
+    # NumPy computes the constants, so that the traced program does not.
+    orders = np.arange(1, num_terms + 1)
+    variances = 1 / (2 * np.pi**2 * orders**2)
+    # The sums of s_r and of s_r^2 over the terms of the remainder, r > num_terms. Over all
+    # r these sums are 1/12 and 1/360. With many terms, rounding could make the second
+    # difference negative.
+    sum_beyond = 1 / 12 - np.sum(variances)
+    sum_of_squares_beyond = max(1 / 360 - np.sum(variances**2), 0)
+    deviations = jnp.asarray(np.sqrt(variances), H.dtype)
     a = deviations * cosines.reshape(m, num_terms)
     b = deviations * sines.reshape(m, num_terms)
     # The integral is `H` if the sum of all cosine coefficients is -H. So the coefficients
-    # must lose the excess, sum plus H. Each loses a share in proportion to its variance,
-    # s_r over the sum of all variances, which is 1/12: this is how to condition independent
-    # Gaussian variables on their sum.
+    # must lose the excess, which is their sum plus H. Independent Gaussian variables are
+    # conditioned on their sum by taking from each a share of the excess in proportion to
+    # its variance: s_r over the sum of all variances, which is 1/12.
     sum_of_all = jnp.sum(a, axis=1) + np.sqrt(sum_beyond) * remainder_sums
     shares = jnp.asarray(12 * variances, H.dtype)
     excess = sum_of_all + H
     a_given_H = a - shares * excess[:, None]
     series = _weighted_product(a_given_H, b, np.pi * orders)
-    # Given H, cosine coefficients of the remainder have the mean -12 s_r H, which gives the
-    # first part of its area, and the variance s_r - 12 s_r^2, which gives the second. Since
-    # (pi r)^2 s_r is 1/2, the variances of these parts are sums of 144 s_r^2 / 2 and of
-    # s_r - 12 s_r^2.
+    # Given H, the cosine coefficients of the remainder have the means -12 s_r H and the
+    # variances s_r - 12 s_r^2. The means give one part of the area of the remainder, the
+    # deviations from them another part. Since (pi r)^2 s_r is 1/2, the variances of these
+    # parts are sums of 144 s_r^2 / 2 (times H^2) and of s_r - 12 s_r^2.
     mean_part = jnp.outer(H, np.sqrt(72 * sum_of_squares_beyond) * mean_parts)
     deviation = np.sqrt(sum_beyond - 12 * sum_of_squares_beyond)
     without_deviation = series - mean_part
-    # The numbers of the pairs above the diagonal, row by row. A gather, since scattering is
-    # slow; for one noise there is no entry to gather from.
-    indices = np.zeros((m, m), int)
-    indices[np.triu_indices(m, 1)] = np.arange(deviation_parts.size)
-    if m < 2:
-        deviation_parts = jnp.append(deviation_parts, 0)
-    deviation_part = deviation * jnp.triu(deviation_parts[indices], 1)
-    # The products a_kr b_lr of the area. The other ones, b_kr a_lr, are their transpose.
+    deviation_part = deviation * _above_diagonal(deviation_parts, m)
+    # The products a_kr b_lr of the area. The products b_kr a_lr are their transpose.
     first_products = without_deviation + deviation_part
     return first_products - first_products.T
+
+
+def _above_diagonal(pair_values: Float[Array, " pairs"], m: int) -> Float[Array, "m m"]:
+    """A matrix with one of the values for each pair of noises above its diagonal, row by
+    row, and zeros elsewhere."""
+    # The values are gathered by their numbers, since scattering them is slow.
+    numbers = np.zeros((m, m), int)
+    numbers[np.triu_indices(m, 1)] = np.arange(pair_values.size)
+    if m < 2:
+        # There is no pair. The gather still needs an entry to read.
+        pair_values = jnp.append(pair_values, 0)
+    return jnp.triu(pair_values[numbers], 1)
 
 
 def _weighted_product(
     a: Float[Array, "m terms"], b: Float[Array, "m terms"], weights: np.ndarray
 ) -> Float[Array, "m m"]:
-    """`a diag(weights) b^T`."""
+    """The matrix product `a diag(weights) b^T`."""
     if len(weights) > _MOST_UNROLLED:
         a = a * jnp.asarray(weights, a.dtype)
         return dot(a, b.T)
@@ -237,5 +251,5 @@ def _weighted_product(
     products = [
         float(weight) * jnp.outer(a[:, i], b[:, i]) for i, weight in enumerate(weights)
     ]
-    # Zeros to start from, since there may be no terms at all.
+    # The sum starts from zeros, since there may be no terms at all.
     return sum(products, jnp.zeros((len(a), len(a)), a.dtype))

@@ -1,3 +1,6 @@
+"""Brownian paths that draw independent random variables in each step: discrete ones for
+weak methods, or Gaussian ones."""
+
 import abc
 import functools as ft
 import math
@@ -12,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from .._custom_types import BM
-from .cells import checked_cell, compose, Piece
+from .cells import checked_cell, compose, Segment
 from .random import (
     AbstractLaw,
     check_key,
@@ -35,7 +38,8 @@ from .stepwise import (
 
 
 if TYPE_CHECKING:
-    # In one module for all, Pyright would take the variables for arguments of `__init__`.
+    # These lines stand in each module that needs them. If one module imported the name from
+    # another, Pyright would take the variables for arguments of `__init__`.
     from typing import ClassVar as AbstractVar
 else:
     from equinox import AbstractVar
@@ -72,11 +76,15 @@ class WeakIncrement(diffrax.AbstractBrownianIncrement):
 
 
 class AbstractPathWithLaws(AbstractStepwisePath):
-    """A path whose steps consist of independent random variables: for each noise, one with
-    each of its `laws`. The law of the increment, `"W"`, comes first.
+    """A path that draws independent random variables in each step: for each noise, one with
+    each of its `laws`. The random words of a step come in sets. Each set is for one law, in
+    the order of `laws`, and has one word for each noise.
+
+    The law of the increment, `"W"`, comes first: it can be drawn without the others.
 
     - `cell`: the length of the cells of which steps are composed; or `None` if each step is
-        sampled separately."""
+        sampled separately.
+    """
 
     shape: AbstractVar[PyTree[jax.ShapeDtypeStruct]]
     key: AbstractVar[PRNGKeyArray]
@@ -88,16 +96,19 @@ class AbstractPathWithLaws(AbstractStepwisePath):
     @abc.abstractmethod
     def laws(self) -> Mapping[str, AbstractLaw]: ...
 
+    def _drawn_laws(self, use_levy: bool) -> Mapping[str, AbstractLaw]:
+        """The laws of the random variables that a step draws: without `use_levy` it draws
+        only the increment."""
+        return self.laws if use_levy else {"W": self.laws["W"]}
+
     def num_words(self, use_levy: bool = False) -> int:
-        num_sets = len(self.laws) if use_levy else 1
-        return num_sets * num_noises(self.shape)
+        return len(self._drawn_laws(use_levy)) * num_noises(self.shape)
 
     def increment(self, words, t0, t1, use_levy: bool = False) -> Increment:
         h = t1 - t0
         set_size = num_noises(self.shape)
-        laws = self.laws if use_levy else {"W": self.laws["W"]}
         variables = {}
-        for i, (name, law) in enumerate(laws.items()):
+        for i, (name, law) in enumerate(self._drawn_laws(use_levy).items()):
             set_of_words = words[i * set_size : (i + 1) * set_size]
             variables[name] = variables_from_words(law, set_of_words, h, self.shape)
         if not use_levy:
@@ -110,22 +121,24 @@ class AbstractPathWithLaws(AbstractStepwisePath):
             return self._drawn_at(place_of(t0, t1), t0, t1, use_levy)
         h = jnp.asarray(self.cell, t0.dtype)
 
-        def sample(i: Array) -> Piece:
-            # The number of a cell serves as its place: it is exact, and the times of the
-            # cell are rounded. Given the words, only the size of a step matters, not where
-            # it begins. Areas are always drawn, so that increments do not depend on
-            # `use_levy`.
+        def sample(i: Array) -> Segment:
+            # The words are drawn for the number of the cell. The number is exact, while the
+            # times of the cell are rounded.
             place = (i.astype(jnp.int32), jnp.array(0))
-            return Piece.from_increment(self._drawn_at(place, 0 * h, h, True), h)
+            # Given the words, only the size of a step matters, not its start. Areas are
+            # always drawn, since segments are made from increments with all variables.
+            increment = self._drawn_at(place, t0=0 * h, t1=h, use_levy=True)
+            return Segment.from_increment(increment, h)
 
-        piece = compose(t0, t1, self.cell, sample, type(self).__name__)
-        return piece.as_increment(self.levy_area, self.shape, t1 - t0, use_levy)
+        segment = compose(t0, t1, self.cell, sample, type(self).__name__)
+        return segment.as_increment(self.levy_area, self.shape, t1 - t0, use_levy)
 
     def _drawn_at(self, place: Place, t0: Array, t1: Array, use_levy: bool):
-        """The increment for the random words of a place on the time axis."""
-        # One set for each law, so that the words of the first do not depend on `use_levy`.
-        num_sets = len(self.laws) if use_levy else 1
-        words = random_words(self.key, place, num_sets, num_noises(self.shape))
+        """The increment from `t0` to `t1`, from the random words for a place on the time
+        axis."""
+        # Further sets leave the first one unchanged, so `W` does not depend on `use_levy`.
+        num_sets = len(self._drawn_laws(use_levy))
+        words = random_words(self.key, place, num_sets, set_size=num_noises(self.shape))
         return self.increment(words.reshape(-1), t0, t1, use_levy)
 
 
@@ -188,15 +201,15 @@ class WeakBrownianPath(AbstractPathWithLaws):
 
     @property
     def laws(self) -> dict[str, AbstractLaw]:
-        # The laws have the order of the random words. `W` is first, so that it does not
-        # depend on the others.
-        laws = {
-            "W": THREE_POINT if self.order == 2 else FOUR_POINT,
-            "second": THREE_POINT if self.second else None,
-            "third": THREE_POINT if self.order == 3 else None,
-            "two_point": TWO_POINT if self.two_point else None,
-        }
-        return {name: law for name, law in laws.items() if law is not None}
+        increment_law = THREE_POINT if self.order == 2 else FOUR_POINT
+        laws: dict[str, AbstractLaw] = {"W": increment_law}
+        if self.second:
+            laws["second"] = THREE_POINT
+        if self.order == 3:
+            laws["third"] = THREE_POINT
+        if self.two_point:
+            laws["two_point"] = TWO_POINT
+        return laws
 
 
 class FixedStepBrownianPath(AbstractPathWithLaws):
@@ -266,8 +279,9 @@ class FixedStepBrownianPath(AbstractPathWithLaws):
 
 
 class CommonBrownianPath(AbstractPathWithLaws):
-    """The Brownian motion of a `FixedStepBrownianPath` with space-time Lévy area and this
-    `cell`, which may be traced here: a path with another one compiles nothing anew."""
+    """The same Brownian motion as a `FixedStepBrownianPath` with space-time Lévy area and
+    the same `cell`. Here the `cell` may be traced, so that paths with different cells share
+    one compiled program."""
 
     shape: PyTree[jax.ShapeDtypeStruct] = eqx.field(
         static=True,

@@ -1,5 +1,10 @@
 """Random words for a step, as a function of a key and of the position of the step; and the
-laws of the scalar random variables computed from them."""
+laws of scalar random variables, which are computed from random words.
+
+A word is a uniformly distributed 32-bit integer, from which one random variable is
+computed. JAX's generator Threefry makes words in pairs, one pair from each hash of a
+counter.
+"""
 
 import abc
 import dataclasses
@@ -17,14 +22,15 @@ from .._batch import materialize
 from .._compat import is_threefry
 
 
-# The position of a step, in units of a power of two, and the exponent of that power.
+# The position of a step on the time axis: an integer number of units of time, and the
+# exponent of the power of two that is the unit. `place_of` computes it.
 Place: TypeAlias = tuple[Integer[Array, ""], Integer[Array, ""]]
 
-# The number of pairs of words that a path, and each wrapper around it, may draw in a step.
-# Above it, three ranges of numbers would not fit below the exponent of the step's size,
-# which takes the upper 12 bits of a counter.
+# The pairs of words of a step are numbered. A path, and each of the two kinds of wrappers
+# that draw words, has a range of this many numbers. The three ranges fit into the 20 bits
+# that a counter has for the number of a pair.
 _MOST_PAIRS = 2**18
-# Pairs of words of a step are numbered. The pairs of wrappers begin at these numbers.
+# The first pairs of wrappers have these numbers. The first pair of a path has the number 0.
 PLATEAU_WORDS = _MOST_PAIRS
 AREA_WORDS = 2 * _MOST_PAIRS
 
@@ -35,8 +41,9 @@ def random_words(
     """Random words for a step at `place`, in `num_sets` sets of `set_size` words each. More
     sets leave the first ones unchanged. Raises a `ValueError` for an array of keys.
 
-    `first_pair` is 0 for a path, and `PLATEAU_WORDS` or `AREA_WORDS` for a wrapper around
-    it: their words are independent, so that they may share a key.
+    `first_pair` is the number of the first pair of words: 0 for a path, and `PLATEAU_WORDS`
+    or `AREA_WORDS` for a wrapper around a path. So the words of a path and of its wrappers
+    are independent, even if they share a key.
     """
     key = typed_key(key)
     if key.ndim > 0:
@@ -48,7 +55,9 @@ def random_words(
     if is_threefry(key) and 0 < num_words <= 2 * _MOST_PAIRS:
         words = _words_from_counters(key, place, num_words, first_pair)
         return words.reshape(num_sets, set_size)
-    # Each set has a key of its own, so that more sets leave the first ones unchanged.
+    # This is for other generators, and for more words than a range of numbers allows (or no
+    # words). Each set has a key of its own, so that more sets leave the first ones
+    # unchanged.
     count, exponent = place
     step_key = jr.fold_in(jr.fold_in(key, count), exponent)
     set_keys = [jr.fold_in(step_key, first_pair + i) for i in range(num_sets)]
@@ -60,9 +69,9 @@ def random_words(
 def _words_from_counters(
     key: PRNGKeyArray, place: Place, num_words: int, first_pair: int
 ) -> UInt32[Array, " num_words"]:
-    """Words of Threefry, of which each hash of a counter yields a pair. The counter is the
-    place and the number of the pair: folding and splitting keys would take three hashes for
-    the first word."""
+    """Words from hashes of counters by Threefry, two from each hash. A counter consists of
+    the place and the number of the pair of words. (Folding the place into the key would
+    take three hashes for the first word.)"""
     count, exponent = place
     num_pairs = (num_words + 1) // 2
     pair_numbers = np.arange(first_pair, first_pair + num_pairs, dtype=np.uint32)
@@ -73,7 +82,7 @@ def _words_from_counters(
 
     def hash_counters() -> tuple[Array, ...]:
         pair = _threefry(jr.key_data(key), count_word, pair_word)
-        # A single word needs only the first of its pair.
+        # If only one word is needed, the second one is not computed.
         return pair[:num_words]
 
     # XLA would compute each of the two words in a separate kernel.
@@ -81,8 +90,10 @@ def _words_from_counters(
     return words.reshape(-1)[:num_words]
 
 
-# Threefry-2x32 rotates by these numbers of bits, in turns, four times before it adds keys.
+# The numbers of bits by which Threefry-2x32 rotates in a group of four rounds. Groups use
+# the first and the second row in turns.
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
+# A constant of Threefry, from which it makes its third key.
 _PARITY = np.uint32(0x1BD11BDA)
 
 
@@ -90,13 +101,16 @@ def _threefry(
     key: UInt32[Array, "2"], count_word: Array, pair_word: Array
 ) -> tuple[Array, Array]:
     """Threefry-2x32 with 20 rounds, by Salmon et al. (SC'11, doi:10.1145/2063384.2063405):
-    the words of JAX's generator for this key and counters `(count_word, pair_word)`.
-    Unrolled, since JAX's version is a loop of eighty kernels on CPUs: three words for each
-    of 512 paths take 3 ns per path instead of 16."""
+    the words of JAX's generator for this key and the counters `(count_word, pair_word)`.
+
+    JAX's own version is a loop, of eighty kernels on CPUs. This one is unrolled: three
+    words for each of 512 paths take 3 ns per path instead of 16.
+    """
     keys = [key[0], key[1], key[0] ^ key[1] ^ _PARITY]
     first = count_word + keys[0]
     second = pair_word + keys[1]
-    # Five groups of four rounds, after each of which two of the keys are added, in turns.
+    # Five groups of four rounds. After each group, two of the three keys are added, in
+    # turns.
     for group in range(5):
         for bits in _ROTATIONS[group % 2]:
             first = first + second
@@ -116,8 +130,8 @@ def check_key(key: Any, caller_name: str) -> None:
 
 
 def is_key(x: Any) -> bool:
-    """Whether this is a random key, or an array of keys. The words of a key from
-    `jax.random.PRNGKey` are told from other integers by their number."""
+    """Whether `x` is a random key, or an array of keys. A key from `jax.random.PRNGKey` is
+    an array of integers: it is recognized by its dtype and the length of its last axis."""
     dtype = getattr(x, "dtype", None)
     if dtype == jnp.uint32:
         return x.shape[-1:] == jax.eval_shape(jr.PRNGKey, 0).shape
@@ -125,13 +139,14 @@ def is_key(x: Any) -> bool:
 
 
 def typed_key(key: PRNGKeyArray | UInt32[Array, "..."]) -> PRNGKeyArray:
-    """The key as one from `jax.random.key`."""
+    """Converts a key from `jax.random.PRNGKey` to a key as from `jax.random.key`. Leaves
+    other keys as they are."""
     return jr.wrap_key_data(key) if key.dtype == jnp.uint32 else key
 
 
 def derived_key(key: PRNGKeyArray, old_key: Array) -> Array:
-    """A key derived from `key` to take the place of `old_key`, of the same kind and shape.
-    Equal old keys get the same new one."""
+    """A key to replace `old_key`, derived from `key` and `old_key`. It has the dtype and
+    shape of `old_key`. Equal old keys are replaced by equal keys."""
     old_words = jr.key_data(typed_key(old_key))
     for word in old_words.reshape(-1):
         key = jr.fold_in(key, word)
@@ -142,26 +157,29 @@ def derived_key(key: PRNGKeyArray, old_key: Array) -> Array:
     return jr.wrap_key_data(new_words, impl=jr.key_impl(old_key))
 
 
-# `place_of` rounds the sizes of steps, times this factor, to powers of two, and their
-# middles, plus this shift, to integers. Neither is a round number: for steps of round
-# numbers, no rounding error can then change the result.
+# `place_of` multiplies the size of a step by this factor and rounds the product down to a
+# power of two. It adds this shift to the middle of the step and rounds the sum down to an
+# integer. The factor and the shift are not round numbers. So if times are round numbers,
+# the product and the sum are never so close to a jump that rounding errors change a result.
 _SIZE_FACTOR = 1.37
 _COUNT_SHIFT = 0.29
 
 
 def place_of(t0: Array, t1: Array) -> Place:
-    r"""The position of a step as two integers, which do not change if times are rounded:
+    r"""The position of a step as two integers $n$ and $e$, which do not change if times are
+    rounded:
 
     $$ n = \Bigl\lfloor \frac{t_0 + t_1}{2 \cdot 2^e} + 0.29 \Bigr\rfloor, \qquad
     e = \lfloor \log_2(1.37\, |t_1 - t_0|) \rfloor - 1. $$
 
-    So the middle of the step is counted in units of $2^e$, which is between a third and 0.7
-    of the step (1.37 times a quarter and a half). Two steps with the same integers have
-    middles less than one unit apart, and are longer than that, so they overlap.
+    So the middle of the step is counted in units of $2^e$. A unit is between a third and
+    0.7 of the step (1.37 times a quarter and a half). Two steps with the same integers
+    overlap: their middles are less than one unit apart, and both are longer than one unit.
     """
     units_per_time, exponent = _inverse_power_of_two(jnp.abs(t1 - t0) * _SIZE_FACTOR)
-    # Late in a long float32 solve, two steps may round to the same middle. So the integer
-    # part of the start, which is exact, is split off before adding half a step.
+    # Late in a long float32 solve, the middles of two steps may be rounded to the same
+    # number. So the integer part of the start, which is exact, is split off before half a
+    # step is added.
     start = t0 * units_per_time
     half = (t1 - t0) / 2 * units_per_time
     whole = jnp.floor(start)
@@ -174,30 +192,32 @@ def place_of(t0: Array, t1: Array) -> Place:
 
 def _inverse_power_of_two(x: Array) -> tuple[Array, Integer[Array, ""]]:
     """`2^-e` and the exponent `e`, where `2^e` is the power of two that is more than a
-    quarter and at most half of `x > 0`. They come from the bits of `x`: `jnp.frexp` and
-    `jnp.ldexp` would take as long as a random word."""
+    quarter and at most half of `x > 0`. Both are read off the bits of `x`: `jnp.frexp` and
+    `jnp.ldexp` would take as long as drawing a random word."""
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(x, f"int{info.bits}")
-    # The bits of `x = 2^k (1 + m)` with `0 <= m < 1` are a sign of zero, the number
-    # `k + bias`, and the mantissa `m`.
+    # The bits of `x = 2^k (1 + m)` with `0 <= m < 1` are, from the highest to the lowest,
+    # the sign, which is zero, the number `k + bias`, and the mantissa `m`.
     k_plus_bias = bits >> info.nmant
     bias = 2 ** (info.nexp - 1) - 1
-    # `2^-k` has the number `-k + bias` and a mantissa of zeros. Since `2^e` is half of
-    # `2^k`, its inverse is twice `2^-k`.
+    # The bits of `2^-k` are those of the number `-k + bias` and a mantissa of zeros. Since
+    # `2^e` is half of `2^k`, its inverse is twice `2^-k`.
     bits_of_inverse = (2 * bias - k_plus_bias) << info.nmant
     inverse = lax.bitcast_convert_type(bits_of_inverse, x.dtype) * 2
     exponent = k_plus_bias.astype(jnp.int32) - (bias + 1)
-    # For an empty step, in which a path has no noise, any unit will do.
+    # Over an empty step a path has no noise, so any unit will do.
     return jnp.where(k_plus_bias > 0, inverse, 1), exponent
 
 
 class AbstractLaw(abc.ABC):
-    """The law of a scalar random variable with mean zero. Laws are compared by value."""
+    """The law of a scalar random variable with mean zero. Laws with the same values are
+    equal."""
 
     @abc.abstractmethod
     def outcomes(self, num_nodes: int) -> tuple[np.ndarray, np.ndarray]:
-        """Values and probabilities of a discrete law, or quadrature points and weights that
-        integrate polynomials of degree `2 num_nodes - 1` exactly."""
+        """For a discrete law, all values and their probabilities. For a continuous law,
+        `num_nodes` quadrature points and their weights, which integrate polynomials of
+        degree `2 num_nodes - 1` exactly."""
 
     @abc.abstractmethod
     def from_words(self, words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
@@ -206,8 +226,9 @@ class AbstractLaw(abc.ABC):
 
 @dataclasses.dataclass(frozen=True)
 class Discrete(AbstractLaw):
-    """Takes `values[i]` with probability `probabilities[i]`, for words `w` with
-    `cuts[i - 1] <= w < cuts[i]`."""
+    """A discrete law: the value `values[i]` has probability `probabilities[i]`, and is the
+    sample for the words `w` with `cuts[i - 1] <= w < cuts[i]`. (There is no cut below the
+    words of the first value, nor above those of the last one.)"""
 
     values: tuple[float, ...]
     probabilities: tuple[float, ...]
@@ -219,9 +240,10 @@ class Discrete(AbstractLaw):
     def from_words(self, words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
         values = [np.asarray(value, dtype) for value in self.values]
         sample = jnp.full(words.shape, values[-1])
-        # Each selection sets the values of all words below its cut, and overwrites earlier
-        # ones. So the largest cut comes first: in the end a word has the value of the
-        # lowest cut above it. A table of values would need a gather, which is slow on CPUs.
+        # Each round sets the samples of all words below a cut, and overwrites what earlier
+        # rounds have set. The largest cut comes first, so that in the end each word has the
+        # value of the lowest cut above it. (To look values up in a table would need a
+        # gather, which is slow on CPUs.)
         for cut, value in zip(reversed(self.cuts), reversed(values[:-1])):
             sample = jnp.where(words < np.uint32(cut), value, sample)
         return sample
@@ -229,7 +251,7 @@ class Discrete(AbstractLaw):
 
 @dataclasses.dataclass(frozen=True)
 class Gaussian(AbstractLaw):
-    """The centred normal distribution. A sample is a monotone function of its word."""
+    """The normal distribution with mean zero. A sample increases with its word."""
 
     variance: float = 1.0
 
@@ -239,17 +261,17 @@ class Gaussian(AbstractLaw):
 
     def from_words(self, words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
         sample = normal_from_words(words, dtype)
-        # XLA would not remove a product with one.
+        # XLA would not remove a multiplication by one.
         if self.variance == 1:
             return sample
         return sample * np.asarray(np.sqrt(self.variance), dtype)
 
 
-# With p the distance of a probability from the nearer of 0 and 1, and q = 1/2 - p, the
-# normal quantile is q F(-log(4 p (1 - p))) with a smooth F. The coefficients of this
-# rational approximation of F, lowest degree first, were fitted by weighted least squares
-# for p >= 2^-33: the largest relative error is 9.7e-9. All are positive, so nothing
-# cancels.
+# Let p be the distance of a probability from the nearer of 0 and 1, and q = 1/2 - p. Up to
+# its sign, the normal quantile at the probability is q F(-log(4 p (1 - p))) with a smooth
+# function F. These are the coefficients of a rational approximation of F, lowest degree
+# first. They were fitted by weighted least squares for p >= 2^-33: the largest relative
+# error is 9.7e-9. All are positive, so that no digits are lost to cancellation.
 _NUMERATOR = (
     2.506628250602876, 0.894851053435387, 0.18198359950254517, 0.025040486604300607,
     0.002275143781368971, 0.00011854314661164789, 3.8177635593160345e-07,
@@ -261,16 +283,17 @@ _DENOMINATOR = (
 
 
 def normal_from_words(words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
-    """The inverse of the normal distribution function, at the middle of each word's
-    interval of length `2^-32`."""
+    """Standard normal samples. Each word stands for an interval of probabilities of length
+    `2^-32`. Its sample is the inverse of the normal distribution function at the middle of
+    the interval."""
     half = np.asarray(0.5, dtype)
     two_intervals = np.asarray(2.0**-31, dtype)
-    # Processors convert signed integers to floats faster than unsigned ones.
+    # `p` and `q` are as for `_NUMERATOR`, but here `q` has the sign of the sample. Adding a
+    # half moves from the start of the word's interval to its middle. Unsigned integers are
+    # reinterpreted as signed ones, which processors convert to floats faster.
     signed = lax.bitcast_convert_type(words ^ np.uint32(2**31), np.int32)
-    # With p and q as for `_NUMERATOR`, 2 q with its sign, which is accurate where q is near
-    # zero; and 2 p, which is accurate in the tails, where p is near zero. Half an interval
-    # more is the middle of it.
     two_q = (signed.astype(dtype) + half) * two_intervals
+    # In the tails `p` is small, so that `two_p = 1 - abs(two_q)` would not be accurate.
     tail = lax.bitcast_convert_type(jnp.minimum(words, ~words), np.int32)
     two_p = (tail.astype(dtype) + half) * two_intervals
     argument = -jnp.log(two_p * (2 - two_p))
@@ -279,7 +302,8 @@ def normal_from_words(words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]
 
 
 def _polynomial(coefficients: tuple[float, ...], x: Array) -> Array:
-    """A polynomial at `x`, by Horner's rule; the lowest degree comes first."""
+    """The value at `x` of the polynomial with these coefficients, lowest degree first, by
+    Horner's rule."""
     highest, *others = reversed(coefficients)
     value = highest
     for coefficient in others:
@@ -297,14 +321,14 @@ _P_LARGE = (3 - math.sqrt(6)) / 12
 _P_SMALL = (3 + math.sqrt(6)) / 12
 _WORDS_OF_LARGE = round(2**32 * _P_LARGE)
 
-# This law matches moments 1 to 5 of the normal distribution. Odd moments vanish exactly,
-# since as many words give one sign as the other.
+# Matches moments 1 to 5 of the normal distribution. Odd moments vanish exactly, since
+# equally many words give the positive and the negative value.
 THREE_POINT = Discrete(
     values=(-_ROOT3, 0.0, _ROOT3),
     probabilities=(1 / 6, 2 / 3, 1 / 6),
     cuts=(_SIXTH_OF_WORDS, 2**32 - _SIXTH_OF_WORDS),
 )
-# This law matches moments 1 to 7. Words below 2^31 give negative values.
+# Matches moments 1 to 7 of the normal distribution. Words below 2^31 give negative values.
 FOUR_POINT = Discrete(
     values=(-_LARGE, -_SMALL, _LARGE, _SMALL),
     probabilities=(_P_LARGE, _P_SMALL, _P_LARGE, _P_SMALL),

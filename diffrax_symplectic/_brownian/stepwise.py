@@ -21,20 +21,22 @@ from .random import AbstractLaw, Gaussian, is_key
 
 
 if TYPE_CHECKING:
-    # In one module for all, Pyright would take the variables for arguments of `__init__`.
+    # These lines stand in each module that needs them. If one module imported the name from
+    # another, Pyright would take the variables for arguments of `__init__`.
     from typing import ClassVar as AbstractVar
 else:
     from equinox import AbstractVar
 
 
-# The value of a path over a step, with `use_levy=False` or with `use_levy=True`.
+# What a path returns for a step: with `use_levy=False` the increment alone, as arrays; with
+# `use_levy=True` an object with all random variables of the step.
 Increment: TypeAlias = PyTree[Array] | diffrax.AbstractBrownianIncrement
 
 
 class AbstractStepwisePath(diffrax.AbstractBrownianPath):
     """A path whose increment over a step is a function of random 32-bit words, one for each
-    scalar random variable. `evaluate` draws the words from a generator; `increment` takes
-    given words, such as low-discrepancy points."""
+    scalar random variable. `evaluate` draws these words from a generator. `increment` takes
+    them as an argument, for example from low-discrepancy points."""
 
     def evaluate(
         self,
@@ -45,16 +47,15 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
     ) -> Increment:
         """The increment over the step from `t0` to `t1` (from `0` to `t0` without `t1`), or
         with `use_levy=True` an object of type `levy_area`."""
-        # A step is drawn as a whole, so there are no limits from either side.
+        # The increment over a whole step has no limits from the left or right.
         del left
         if t1 is None:
             ends = (jnp.asarray(jnp.zeros_like(t0)), jnp.asarray(t0))
         else:
             ends = (jnp.asarray(t0), jnp.asarray(t1))
-        # The words are integers computed from the times, so that JAX would silently take
-        # the derivative with respect to the times for zero.
+        # The words are integers that are computed from the times. So JAX would silently
+        # return zero for the derivative with respect to the times.
         start, end = cast(tuple[Array, Array], nondifferentiable(ends, name="t"))
-        # As a program of its own, which is traced once for all steps of a solve.
         return _draw_increment(self, start, end, use_levy)
 
     @abc.abstractmethod
@@ -64,13 +65,14 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
     @property
     @abc.abstractmethod
     def laws(self) -> Mapping[str, AbstractLaw] | None:
-        """The laws of the independent random variables of a step of size 1, by their name
-        in the increment; over a step of size `h` they are scaled by `sqrt(h)`. `None` if
-        increments contain anything else."""
+        """The laws of the random variables of a step of size 1, by their name in the
+        increment, in the order of their random words. The variables are independent, and
+        over a step of size `h` they are scaled by `sqrt(h)`. `None` if increments contain
+        anything else."""
 
     @abc.abstractmethod
     def num_words(self, use_levy: bool = False) -> int:
-        """The number of words that `increment` needs."""
+        """The number of random words that `increment` needs."""
 
     @abc.abstractmethod
     def increment(
@@ -80,17 +82,20 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
         t1: RealScalarLike,
         use_levy: bool = False,
     ) -> Increment:
-        """The increment over the step from `t0` to `t1`, from given words."""
+        """The increment over the step from `t0` to `t1`, from given random words."""
 
 
-# Diffrax traces a step three times, and `jax.vmap` traces the body of a loop more often.
+# With `filter_jit` a path is traced once for all steps of a solve. Diffrax traces a step
+# three times, and `jax.vmap` traces the body of a loop more often.
 @eqx.filter_jit
 def _draw_increment(path: AbstractStepwisePath, t0: Array, t1: Array, use_levy: bool):
     return path.draw(t0, t1, use_levy)
 
 
 class AbstractWrappedPath(AbstractStepwisePath):
-    """A Brownian path that changes or extends the increments of another."""
+    """A Brownian path that changes or extends the increments of another one, the wrapped
+    `path`. The random words that it draws in addition to those of the wrapped path are
+    called its own words."""
 
     path: AbstractVar[diffrax.AbstractBrownianPath]
 
@@ -104,7 +109,7 @@ class AbstractWrappedPath(AbstractStepwisePath):
 
     @abc.abstractmethod
     def num_own_words(self, use_levy: bool) -> int:
-        """The number of random words that `own_increment` needs."""
+        """The number of own words that `own_increment` needs."""
 
     @abc.abstractmethod
     def own_increment(
@@ -113,15 +118,17 @@ class AbstractWrappedPath(AbstractStepwisePath):
         own_words: UInt32[Array, " num_own_words"],
         h: RealScalarLike,
     ) -> Increment:
-        """The increment of this path over a step of size `h`, from that of the other: with
-        `use_levy=False` an increment alone, and otherwise one with all variables."""
+        """The increment of this path over a step of size `h`, from the `increment` of the
+        wrapped path. With `use_levy=False` both are arrays, and there are no own words;
+        with `use_levy=True` both are objects with all random variables."""
 
     def num_words(self, use_levy: bool = False) -> int:
         wrapped = checked_stepwise(self.path)
         return wrapped.num_words(use_levy) + self.num_own_words(use_levy)
 
     def increment(self, words, t0, t1, use_levy: bool = False) -> Increment:
-        # The words of the wrapped path come first, as if it were alone.
+        # The words of the wrapped path come first. It does not read the own words, which
+        # come after them.
         wrapped = checked_stepwise(self.path)
         increment = wrapped.increment(words, t0, t1, use_levy)
         own_words = words[wrapped.num_words(use_levy) :]
@@ -163,8 +170,8 @@ class UnspecifiedPath(diffrax.AbstractBrownianPath):
 
 
 def checked_stepwise(path: diffrax.AbstractBrownianPath) -> AbstractStepwisePath:
-    """The same path. Raises a `ValueError` if its steps cannot be computed from given
-    words."""
+    """Returns the path, if its increments can be computed from given random words. Raises a
+    `ValueError` otherwise."""
     if not isinstance(path, AbstractStepwisePath):
         raise ValueError(
             "The random variables of this path cannot be set from outside. Use a "
@@ -187,8 +194,8 @@ GAUSSIAN_LAWS: Mapping[type, Mapping[str, AbstractLaw]] = {
 
 
 def laws_of(path: diffrax.AbstractBrownianPath) -> Mapping[str, AbstractLaw] | None:
-    """The laws of the random variables of a step of size 1, by their name in the increment;
-    or `None` if they are unknown."""
+    """The laws of the random variables of a step of any path, as in
+    `AbstractStepwisePath.laws`; or `None` if they are unknown."""
     if isinstance(path, AbstractStepwisePath):
         return path.laws
     # Diffrax's paths do not state their laws. Paths of other classes may have any law.
@@ -198,7 +205,7 @@ def laws_of(path: diffrax.AbstractBrownianPath) -> Mapping[str, AbstractLaw] | N
 
 
 def is_random(path: diffrax.AbstractBrownianPath) -> bool:
-    """Whether a path draws its noise from a random key, instead of holding given noise such
+    """Whether a path draws its noise from a random key. Other paths hold given noise, such
     as a record."""
     holds_a_key = any(is_key(leaf) for leaf in jtu.tree_leaves(path))
     return holds_a_key or isinstance(path, UnspecifiedPath)
@@ -208,16 +215,17 @@ def is_random(path: diffrax.AbstractBrownianPath) -> bool:
 def increment_struct(
     path: diffrax.AbstractBrownianPath,
 ) -> PyTree[jax.ShapeDtypeStruct]:
-    """The shapes and dtypes of an increment, in its structure."""
+    """The structure, shapes and dtypes of the increments of a path."""
     if isinstance(path, UnspecifiedPath):
         return path.shape
-    # Times have the dtype that they have in a solve, where the trace of `evaluate` that is
-    # made here is used again.
+    # This is the dtype of times in a solve, so that JAX uses the trace made here again when
+    # the solve evaluates the path.
     time = jax.ShapeDtypeStruct((), jnp.result_type(float))
     return jax.eval_shape(lambda *ends: path.evaluate(*ends), time, time)
 
 
 def num_noises(shape: PyTree[jax.ShapeDtypeStruct]) -> int:
+    """The number of scalar noises of a path of this shape."""
     return sum(leaf.size for leaf in jtu.tree_leaves(shape))
 
 
@@ -229,8 +237,8 @@ def zeros_and_unravel(like: PyTree) -> tuple[Array, Callable]:
 
 
 def step_size(h: RealScalarLike, shape: PyTree[jax.ShapeDtypeStruct]) -> PyTree[Array]:
-    """The field `dt` of an increment of this shape."""
-    # Diffrax's increments have one step size for each leaf, in the dtype of the leaf.
+    """The step size `h` as the field `dt` of an increment of this shape: Diffrax has one
+    step size for each leaf, in the dtype of the leaf."""
     return jtu.tree_map(lambda leaf: jnp.asarray(h, leaf.dtype), shape)
 
 
@@ -240,8 +248,8 @@ def variables_from_words(
     h: RealScalarLike,
     like: PyTree[jax.ShapeDtypeStruct | Array],
 ) -> PyTree[Array]:
-    """A random variable with this law for each noise, over a step of size `h`, in the
-    structure, shapes and dtypes of `like`."""
+    """Random variables over a step of size `h`, one with this law for each noise. They are
+    computed from one word for each, and have the structure, shapes and dtypes of `like`."""
     leaves, treedef = jtu.tree_flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])
     # `h` is negative backward in time. Diffrax itself negates the increments.
@@ -257,10 +265,12 @@ def variables_from_words(
 def checked_shape(
     shape: tuple[int, ...] | PyTree[jax.ShapeDtypeStruct], path_name: str
 ) -> PyTree[jax.ShapeDtypeStruct]:
-    """The shape of the increments of a path; a tuple of integers means a single array.
-    Raises a `ValueError` for anything else, and for dtypes that are not real."""
+    """The shape of the increments of a path as a PyTree of `jax.ShapeDtypeStruct`s. A tuple
+    of integers is the shape of a single array. Raises a `ValueError` for anything else, and
+    for dtypes that are not real floating-point."""
     if isinstance(shape, tuple) and all(isinstance(size, int) for size in shape):
-        # The dtype is the default of this moment, which may change before a step is drawn.
+        # JAX's default dtype is fixed now, since the user may change it before a step is
+        # drawn.
         shape = jax.ShapeDtypeStruct(shape, jnp.result_type(float))
     for leaf in jtu.tree_leaves(shape):
         if not isinstance(leaf, jax.ShapeDtypeStruct) or min(leaf.shape, default=0) < 0:

@@ -1,5 +1,5 @@
-"""The random variables of a step: a record of each, for solvers, conditions and
-suggestions."""
+"""The random variables of a step, with the facts about each that solvers, conditions on
+tableaus and suggestions need."""
 
 import functools as ft
 from collections.abc import Callable, Collection
@@ -13,7 +13,7 @@ from .paths import FixedStepBrownianPath, WeakBrownianPath, WeakIncrement
 from .wrappers import PlateauBrownianPath, PlateauIncrement, TruncatedBrownianPath
 
 
-# Makes a Brownian path of a shape from a key.
+# Makes a Brownian path from a shape and a key.
 _MakePath: TypeAlias = Callable[[Any, PRNGKeyArray], diffrax.AbstractBrownianPath]
 
 _path_with_space_time_area = ft.partial(
@@ -25,7 +25,7 @@ def _truncated_path(shape: Any, key: PRNGKeyArray) -> TruncatedBrownianPath:
     return TruncatedBrownianPath(FixedStepBrownianPath(shape, key))
 
 
-# A wrapper may share the key of its path: it draws other random words from the key.
+# A wrapper and its path may share a key: they draw different random words from it.
 def _path_with_levy_areas(shape: Any, key: PRNGKeyArray) -> LevyAreaBrownianPath:
     return LevyAreaBrownianPath(_path_with_space_time_area(shape, key), key)
 
@@ -35,19 +35,20 @@ def _path_with_plateaus(shape: Any, key: PRNGKeyArray) -> PlateauBrownianPath:
 
 
 class RandomVariable(NamedTuple):
-    """One random variable of a step for each noise (or for each pair of noises).
+    """Facts about a random variable that a step has for each noise, or for each pair of
+    noises.
 
-    - `increment`: the type of increments that contain it.
+    - `increment`: the type of increments that contain the variable.
     - `name`: its name in messages.
-    - `path`: makes a path that has it.
+    - `path`: makes a path that has the variable.
     - `rank`: a path with a variable of higher rank also has those of lower rank that a
         solver may need with it. So the highest rank decides which path a solver needs.
-    - `variance`: in units of the step size, the same for all laws; `None` if it has no law
-        of its own.
-    - `even`: whether it is unchanged when time runs backward, although Diffrax negates all
-        random variables.
-    - `drives`: the vector fields that it multiplies: the noise, the brackets between
-        noises, or their brackets with the drift.
+    - `variance`: the variance in units of the step size, which is the same for all laws
+        that the variable may have; `None` if it has no law independent of the others.
+    - `even`: whether the variable is unchanged if the path is reversed in time. (In a solve
+        backward in time Diffrax negates all random variables, even ones, too.)
+    - `drives`: the vector fields that the variable multiplies: those of the noise, the
+        brackets between noises, or the brackets of noises with the drift.
     """
 
     increment: type[diffrax.AbstractBrownianIncrement]
@@ -60,12 +61,12 @@ class RandomVariable(NamedTuple):
 
     @property
     def advice(self) -> str:
-        """The name of the variable, and how to get a path with it."""
+        """The end of a message: the name of the variable, and how to get a path with it."""
         return f"{self.name}. Make its path by `solver.path(shape, key)`"
 
 
-# `H` and `L` are variables of the same increment and path, and so are `C` and `sign`: these
-# functions make their records, given in what the two differ.
+# `H` and `L` belong to the same increment and path, and so do `C` and `sign`. These
+# functions make their records, and hold what the two records have in common.
 _area = ft.partial(
     RandomVariable,
     increment=diffrax.AbstractSpaceTimeLevyArea,
@@ -81,27 +82,27 @@ _plateau = ft.partial(
     rank=5,
 )
 
-# The random variables, by the attribute of the increment that holds them.
+# All random variables, by name. Each but `L` is an attribute of the increment.
 VARIABLES = {
     "A": RandomVariable(
         increment=LevyAreaIncrement,
         name="Lévy areas",
         path=_path_with_levy_areas,
         rank=6,
-        # Their law is known only given the increments.
+        # The law of the areas is known only given `W` and `H`.
         variance=None,
         drives="noise brackets",
     ),
     "C": _plateau(variance=1 / 6),
-    # The sign of `C`. Only the sign is drawn: the size is a function of `W` and `H`.
+    # The sign of `C`. Only the sign is drawn: the size of `C` is a function of `W` and `H`.
     "sign": _plateau(variance=1.0),
     "L": _area(
-        # A quadratic form in `W`, `H` and, if the increment has it, `K`.
+        # `L` is a quadratic form in `W`, `H` and, if the increment has it, `K`.
         variance=None,
         even=True,
         drives="drift brackets",
     ),
-    # The time-reversed bridge has the same integral.
+    # A Brownian bridge that is reversed in time has the same integral.
     "H": _area(variance=1 / 12, even=True),
     "third": RandomVariable(
         increment=WeakIncrement,
@@ -131,14 +132,15 @@ VARIABLES = {
 
 
 def drives(name: str) -> str:
-    """The vector fields that the random variable of this name multiplies, as in
-    `RandomVariable`: for an unknown variable those of the noise."""
+    """What the random variable of this name multiplies, as in `RandomVariable.drives`.
+    Variables that are not known here multiply the noise."""
     return VARIABLES[name].drives if name in VARIABLES else "noise"
 
 
 def most_demanding_variable(names: Collection[str]) -> RandomVariable | None:
-    """The random variable of the highest rank among these, or `None` if all are unknown."""
-    # A solver of the user's own may have variables that are not known here.
+    """The random variable of the highest rank among these, or `None` if none of them is
+    known here."""
+    # A user's solver may have variables that are not known here.
     variables = [VARIABLES[name] for name in names if name in VARIABLES]
     return max(variables, key=lambda variable: variable.rank, default=None)
 
@@ -146,10 +148,14 @@ def most_demanding_variable(names: Collection[str]) -> RandomVariable | None:
 def path_maker(
     variables: Collection[str], *, gaussian: bool, bounded: bool
 ) -> _MakePath:
-    """A function of a shape and a key that makes a path with these random variables. If
-    only increments are needed, they may be `gaussian`, and then also `bounded`, for
-    implicit methods."""
-    # In the table, the path of `"W"` is the discrete one, not for Gaussian increments.
+    """A function of a shape and a key that makes a path with these random variables.
+
+    The options matter only if no variable but the increment `"W"` decides on the path:
+
+    - `gaussian`: whether increments are Gaussian, not discrete;
+    - `bounded`: whether Gaussian increments are truncated, for implicit methods.
+    """
+    # The path of `"W"` in `VARIABLES` is the discrete one.
     names = set(variables) - {"W"} if gaussian else variables
     variable = most_demanding_variable(names)
     if variable is not None:

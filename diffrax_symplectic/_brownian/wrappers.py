@@ -1,3 +1,5 @@
+"""Paths that change or extend the increments of another path: truncation, and plateaus."""
+
 import dataclasses
 import math
 from typing import ClassVar
@@ -48,7 +50,8 @@ def check_space_time_area(
     path: diffrax.AbstractBrownianPath, wrapper_name: str
 ) -> None:
     """Raises a `ValueError` unless the increments of `path` have space-time Lévy area."""
-    # Anything that is no path fails the same test.
+    # An object without `levy_area` is no path, and fails the test below like a path without
+    # space-time Lévy area.
     area = getattr(path, "levy_area", type(None))
     if not issubclass(area, diffrax.AbstractSpaceTimeLevyArea):
         raise ValueError(
@@ -97,9 +100,9 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 
     path: diffrax.AbstractBrownianPath
     k: int = eqx.field(static=True)
-    # `None` is the unit of the user's times. (A number would be one more leaf of the path.)
+    # `None` means 1. (The number 1 would be one more leaf of the path.)
     unit: RealScalarLike | None
-    # A truncated law depends on the size of the step.
+    # A truncated law is not that of a step of size 1, scaled by `sqrt(h)`.
     laws: ClassVar[None] = None  # pyright: ignore
 
     def __init__(
@@ -134,7 +137,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
             )
         if unit is not None:
             is_number = eqx.is_array_like(unit) and jnp.shape(unit) == ()
-            # A traced number is positive as far as it is known.
+            # The sign of a traced number is not known, and is not checked.
             if not is_number or not (is_traced(unit) or 0 < float(unit) < math.inf):
                 raise ValueError(f"`unit` must be a positive number; got {unit!r}.")
         self.path = path
@@ -154,12 +157,13 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         return 0
 
     def own_increment(self, increment, own_words, h) -> Increment:
+        """Truncates the increment of the wrapped path. There are no own words."""
         length = jnp.abs(h)
         length_in_units = length
         if self.unit is not None:
             length_in_units = length / jnp.asarray(self.unit, length.dtype)
         checked = eqx.error_if(length_in_units, length_in_units >= 1, STEP_BEYOND_UNIT)
-        # The logarithm of 1 is zero, and so is the bound of an empty step.
+        # For an empty step, the logarithm of 1 instead of 0 keeps the bound at zero.
         log_length_in_units = jnp.log(jnp.where(checked > 0, checked, 1))
         bound = jnp.sqrt(2 * self.k * length * jnp.abs(log_length_in_units))
 
@@ -173,22 +177,27 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 
 def lost_variance(path: diffrax.AbstractBrownianPath, h: float) -> float:
     """The share of the variance of an increment over a step of size `h` that is lost by
-    truncation. If wrappers truncate several times, the largest share of one of them."""
+    truncation. If several wrappers truncate, it is the largest of their shares."""
     share = 0.0
     remaining = path
     while isinstance(remaining, AbstractWrappedPath):
         if isinstance(remaining, TruncatedBrownianPath):
-            # The bound in standard deviations, `A_h` in the docstring of the class; zero
-            # for steps of a `unit` and longer, of which nothing is left.
+            # The bound in standard deviations is `A_h` in the docstring of the class. It is
+            # zero for steps of at least one `unit`, of which nothing is left.
             unit = 1.0 if remaining.unit is None else float(remaining.unit)
             bound = math.sqrt(2 * remaining.k * max(-math.log(h / unit), 0))
-            # `1 - E[min(|x|, bound)^2]` for a standard normal `x`, by partial integration
-            # of `x^2 - bound^2` over both tails.
-            density = math.exp(-(bound**2) / 2) / math.sqrt(2 * math.pi)
-            tail = math.erfc(bound / math.sqrt(2)) / 2
-            share = max(share, 2 * (bound * density + (1 - bound**2) * tail))
+            share = max(share, _variance_beyond(bound))
         remaining = remaining.path
     return share
+
+
+def _variance_beyond(bound: float) -> float:
+    """The variance `1 - E[min(|x|, bound)^2]` that a standard normal variable `x` loses if
+    it is clipped to the interval from `-bound` to `bound`."""
+    # This is the integral of `(x^2 - bound^2) density(x)` over both tails, by parts.
+    density_at_bound = math.exp(-(bound**2) / 2) / math.sqrt(2 * math.pi)
+    tail_probability = math.erfc(bound / math.sqrt(2)) / 2
+    return 2 * (bound * density_at_bound + (1 - bound**2) * tail_probability)
 
 
 class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
@@ -215,14 +224,14 @@ class PlateauIncrement(diffrax.AbstractSpaceTimeLevyArea):
 
     @property
     def C(self) -> BM:
-        def of_array(h: Array, W: Array, H: Array, sign: Array) -> Array:
-            # In a solve backward in time Diffrax negates everything, including the step
+        def half_difference(h: Array, W: Array, H: Array, sign: Array) -> Array:
+            # In a solve backward in time Diffrax negates all fields, including the step
             # size.
             h = jnp.abs(h).astype(W.dtype)
             size = jnp.sqrt(h / 15 + W**2 / 12 + H**2 / 5)
             return jnp.copysign(size, sign)
 
-        return jtu.tree_map(of_array, self.dt, self.W, self.H, self.sign)
+        return jtu.tree_map(half_difference, self.dt, self.W, self.H, self.sign)
 
 
 class PlateauBrownianPath(AbstractWrappedPath):
@@ -252,22 +261,27 @@ class PlateauBrownianPath(AbstractWrappedPath):
         laws = laws_of(self.path)
         if laws is None:
             return None
-        # These increments do not include space-time-time areas. The laws have the order of
-        # the random words, of which those of the wrapped path come first.
+        # The space-time-time area that a wrapped path may have is left out. The own random
+        # words, which are for the signs, come last.
         return {"W": laws["W"], "H": laws["H"], "sign": TWO_POINT}
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         increment = self.path.evaluate(t0, t1, use_levy=use_levy)
         if not use_levy:
             return increment
-        num_words = self.num_own_words(use_levy)
-        words = random_words(self.key, place_of(t0, t1), 1, num_words, PLATEAU_WORDS)
+        place = place_of(t0, t1)
+        size = self.num_own_words(use_levy)
+        words = random_words(
+            self.key, place, num_sets=1, set_size=size, first_pair=PLATEAU_WORDS
+        )
         return self.own_increment(increment, words[0], t1 - t0)
 
     def num_own_words(self, use_levy: bool) -> int:
         return num_noises(increment_struct(self.path)) if use_levy else 0
 
     def own_increment(self, increment, own_words, h) -> Increment:
+        """Adds signs to the increment of the wrapped path, one from each own word."""
+        # With `use_levy=False` an increment is `W` alone.
         if not isinstance(increment, diffrax.AbstractSpaceTimeLevyArea):
             return increment
         sign = variables_from_words(TWO_POINT, own_words, h, increment.W)

@@ -1,3 +1,10 @@
+"""Tableaus: coefficients of Runge-Kutta methods as data, and what follows from them.
+
+- `tableau`: the families of tableaus, and the flat form that all of them have.
+- `conditions`: symplecticity, orders and reversibility, from the coefficients.
+- `plan`: the plan of a step, which says what stages to solve for or evaluate, in order.
+"""
+
 from .conditions import (
     drift_order as drift_order,
     is_own_inverse as is_own_inverse,

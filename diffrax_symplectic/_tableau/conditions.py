@@ -20,8 +20,9 @@ from .tableau import (
 )
 
 
-# Coefficients such as those of the Gauss methods are rounded, and sums of their products
-# more so; a wrong coefficient misses a condition by far more.
+# The largest residual of a condition that counts as zero. Coefficients such as those of the
+# Gauss methods are rounded, and so are sums of their products. A wrong coefficient misses a
+# condition by far more.
 _ROUNDING = 1e-12
 
 
@@ -44,8 +45,8 @@ def symplectic_residuals(tableau: AbstractTableau) -> Float[np.ndarray, "s s"]:
     """
     flat = tableau.flatten()
     weighted = flat.weights[:, None] * flat.matrix
-    # Quadratic invariants are conserved if the residuals vanish. Only pairs of stages that
-    # read what the other writes contribute to the change of an invariant.
+    # Quadratic invariants are conserved if the residuals vanish. A pair of stages adds to
+    # the change of an invariant only if each reads what the other writes.
     residuals = np.outer(flat.weights, flat.weights) - weighted - weighted.T
     return np.where(flat.reads_from & flat.reads_from.T, residuals, 0.0)
 
@@ -88,13 +89,14 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
     r"""Residuals of the conditions for a strong order, with Gaussian increments:
 
     - 1/2 for a [`diffrax_symplectic.GeneralTableau`][]: all noises have the same
-        coefficients, so the iterated integrals of two of them are missing. 1 if they
-        commute, when these are not needed;
+        coefficients, so the iterated integrals of two noises are missing. Strong order 1 if
+        the noises commute, since then the integrals are not needed;
     - 1 for a [`diffrax_symplectic.SeparableTableau`][] or
         [`diffrax_symplectic.PartitionedTableau`][];
     - 3/2 for an [`diffrax_symplectic.AdditiveTableau`][], in the variables $I_k = W_k$
-        and $I_{k0} / h = W_k / 2 + H_k$. Those on the times `c1` are there for a `constant`
-        tableau, too, though noise that does not depend on time does not need them.
+        and $I_{k0} / h = W_k / 2 + H_k$. The conditions on the times `c1` are included for
+        a `constant` tableau, too, although noise that does not depend on time does not need
+        them.
 
     **Arguments:**
 
@@ -114,30 +116,31 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
 
 
 def drift_order(tableau: FlatTableau) -> int:
-    """The order without noise, up to 4, by Butcher's conditions for each part of the state
-    that the stages write."""
+    """The order without noise, up to 4. Butcher's conditions must hold for each part of the
+    state that the stages write."""
     drift_stages = [
         i for i, stage in enumerate(tableau.stages) if stage.channels == ("h",)
     ]
     flat = tableau.take(drift_stages)
     writes = np.array([stage.writes for stage in flat.stages])
-    # Coefficients of values that a stage does not read belong to no rooted tree.
+    # Coefficients of values that a stage does not read have no effect.
     M = np.where(flat.reads_from, flat.matrix, 0.0)
     e = np.ones(len(drift_stages))
     c = M @ e
-    # For each order the vectors of its rooted trees, and the exact value of their products
-    # with the weights (Hairer, Norsett and Wanner, Solving Ordinary Differential Equations
-    # I, section II.2).
+    # One row for each order, with a pair for each rooted tree: a vector, and the value that
+    # its product with the weights must have (Hairer, Norsett and Wanner, Solving Ordinary
+    # Differential Equations I, section II.2).
     conditions = (
         [(e, 1)],
         [(c, 1 / 2)],
         [(c**2, 1 / 3), (M @ c, 1 / 6)],
         [(c**3, 1 / 4), (c * (M @ c), 1 / 8), (M @ c**2, 1 / 12), (M @ M @ c, 1 / 24)],
     )
-    # Conditions number k are for order k + 1. If one of them fails, the order is k.
+    # Row number k is for order k + 1. If one of its conditions fails, the order is k.
     for order_so_far, trees in enumerate(conditions):
         for (vector, exact), part in itertools.product(trees, set(writes)):
-            # Momenta and positions have weights of their own, and each part its condition.
+            # Stages that write momenta and stages that write positions have separate
+            # weights. The condition holds for both.
             in_part = writes == part
             value = flat.weights[in_part] @ vector[in_part]
             if abs(value - exact) > _ROUNDING:
@@ -152,14 +155,17 @@ def _unknown_tableau(tableau: AbstractTableau) -> NoReturn:
     )
 
 
-# The residuals of the conditions for the strong order of a tableau's family, by formula;
-# and those for its weak orders: for order 1, and those that order 2 needs beside them.
+# Both functions get a version for each family of tableaus below. `_strong_conditions`
+# returns a dictionary from the formula of each condition to its residual.
+# `_weak_conditions` returns two such dictionaries: the conditions for weak order 1, and
+# those that weak order 2 needs in addition. In formulas `e` is the vector of ones, and
+# products of vectors are taken entry by entry.
 _strong_conditions: Any = ft.singledispatch(_unknown_tableau)
 _weak_conditions: Any = ft.singledispatch(_unknown_tableau)
 
 
 @_strong_conditions.register
-def _(tableau: GeneralTableau) -> dict:
+def _strong_conditions_general(tableau: GeneralTableau) -> dict:
     _check_only_increment_drives_noise(tableau)
     return {
         "alpha.e - 1": tableau.alpha.sum() - 1,
@@ -169,17 +175,16 @@ def _(tableau: GeneralTableau) -> dict:
 
 
 @_strong_conditions.register
-def _(tableau: SeparableTableau) -> dict:
-    # The other random variables of the paper are functions of `W`, as in
-    # `_weak_conditions`, so that there is one more condition for each.
-    others = _conditions_on_other_variables(
-        tableau.beta, {"A1e": tableau.A1.sum(axis=1)}
-    )
+def _strong_conditions_separable(tableau: SeparableTableau) -> dict:
+    # The random variables of the paper's tableaus other than `W` need not have mean zero:
+    # one of them is `sqrt(h)`. So there is one more condition on the weights of each.
+    vectors = {"A1e": tableau.A1.sum(axis=1)}
+    others = _conditions_on_other_variables(tableau.beta, vectors)
     return _strong_conditions(tableau.partitioned()) | others
 
 
 @_strong_conditions.register
-def _(tableau: PartitionedTableau) -> dict:
+def _strong_conditions_partitioned(tableau: PartitionedTableau) -> dict:
     return {
         "alpha.e - 1": tableau.alpha.sum() - 1,
         "alpha_hat.e - 1": tableau.alpha_hat.sum() - 1,
@@ -189,21 +194,20 @@ def _(tableau: PartitionedTableau) -> dict:
 
 
 @_strong_conditions.register
-def _(tableau: AdditiveTableau) -> dict:
-    # The strong expansion has the terms of the weak one, and at order 3/2 the integrals
-    # with the space-time area.
+def _strong_conditions_additive(tableau: AdditiveTableau) -> dict:
+    # The strong expansion of the solution has the terms of the weak expansion, and at order
+    # 3/2 also integrals that contain the space-time area `H`.
     first, second = _weak_conditions(tableau)
     alpha = tableau.alpha
     c1 = tableau.c1
-    # A tableau without the space-time area has zeros here, and fails its conditions.
+    # A tableau without `H` gets zeros, and fails the conditions on `H`.
     B_H = tableau.B.get("H", np.zeros((len(alpha), len(c1))))
     beta_H = tableau.beta.get("H", np.zeros(len(c1)))
-    # The expansion has no other variables.
-    others = {
-        f"alpha.B[{name}]e": alpha @ matrix.sum(axis=1)
-        for name, matrix in tableau.B.items()
-        if name not in ("W", "H")
-    }
+    # The expansion has no other variables, so their contributions must vanish.
+    others = {}
+    for name, matrix in tableau.B.items():
+        if name not in ("W", "H"):
+            others[f"alpha.B[{name}]e"] = alpha @ matrix.sum(axis=1)
     for name, weights in tableau.beta.items():
         if name not in ("W", "H"):
             others[f"beta[{name}].c1"] = weights @ c1
@@ -218,10 +222,11 @@ def _(tableau: AdditiveTableau) -> dict:
 
 
 @_weak_conditions.register
-def _(tableau: GeneralTableau) -> tuple[dict, dict]:
-    """For one noise, and order 1 for any number."""
+def _weak_conditions_general(tableau: GeneralTableau) -> tuple[dict, dict]:
+    """The conditions for weak order 1 hold for any number of noises, those for weak order 2
+    for one noise."""
     _check_only_increment_drives_noise(tableau)
-    # Short names, for formulas that can be compared with their keys.
+    # With short names the expressions below can be compared with their formulas.
     al = tableau.alpha
     be = tableau.beta
     A1 = tableau.A1
@@ -231,9 +236,9 @@ def _(tableau: GeneralTableau) -> tuple[dict, dict]:
     A1e = A1.sum(axis=1)
     B0e = B0.sum(axis=1)
     B1e = B1.sum(axis=1)
-    # The double brackets have the expectation E L_kl = h^2 delta_kl / 12 times
-    # [b, [b, a]] = a''bb + a'b'b - b''ba - 2 b'a'b + b'b'a, which adds to the conditions on
-    # these five derivatives.
+    # The random variable "L" multiplies brackets with the drift. It has the mean
+    # E L_kl = h^2 delta_kl / 12, and [b, [b, a]] = a''bb + a'b'b - b''ba - 2 b'a'b + b'b'a.
+    # So multiples of the number `L` enter the conditions on these five derivatives.
     has_brackets = "drift brackets" in map(drives, tableau.noise)
     L = be.sum() / 12 if has_brackets else 0.0
     first = {
@@ -261,8 +266,8 @@ def _(tableau: GeneralTableau) -> tuple[dict, dict]:
 
 
 @_weak_conditions.register
-def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
-    """For random variables that are independent of each other."""
+def _weak_conditions_partitioned(tableau: PartitionedTableau) -> tuple[dict, dict]:
+    """The random variables are taken to be independent, with mean zero."""
     be = tableau.beta["W"]
     A1 = tableau.A1
     B0e = {name: B0.sum(axis=1) for name, B0 in tableau.B0.items()}
@@ -272,8 +277,8 @@ def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
         "(beta.e)^2 - 1": be.sum() ** 2 - 1,
         **_conditions_on_other_variables(tableau.beta, {"e": np.ones(len(A1))}),
     }
-    # As they are independent, the mean of a product of two vanishes unless they are the
-    # same: only squares are left, with the variance as their mean.
+    # The mean of a product of two different variables vanishes. The mean of the square of a
+    # variable is its variance.
     sum_of_squares = sum(
         _variance(name) * (tableau.alpha_hat @ row_sums**2)
         for name, row_sums in B0e.items()
@@ -296,32 +301,38 @@ def _(tableau: PartitionedTableau) -> tuple[dict, dict]:
 
 
 @_weak_conditions.register
-def _(tableau: SeparableTableau) -> tuple[dict, dict]:
-    """With conditions on the other random variables of the method's paper (Wang, Hong and
-    Xu 2017, equations (3.3)-(3.5)), such as `(W^2 - h) / (2 sqrt(h))`: functions of `W`."""
-    # A `PartitionedTableau` has sums over all variables, which assume that they are
-    # independent. Here products of the others with powers of `W` have means other than
-    # zero, so the sums are taken over `W` alone, and for each of the others there are
-    # conditions of its own: its weights times each of these moments vanish.
+def _weak_conditions_separable(tableau: SeparableTableau) -> tuple[dict, dict]:
+    """Random variables other than `W` are taken to be functions of `W`, as in the paper
+    (Wang, Hong and Xu 2017, equations (3.3)-(3.5)): for example `(W^2 - h) / (2 sqrt(h))`.
+    """
+    # The conditions for a `PartitionedTableau` are for independent variables. So here they
+    # are used for `W` alone.
     only_W = {"W": tableau.B0["W"]}
     partitioned = dataclasses.replace(tableau.partitioned(), B0=only_W)
     first, second = _weak_conditions(partitioned)
+    # From stage to stage the noise changes by terms with these coefficients, times the
+    # powers 0, 1 and 2 of `W`. The product of such a term with another variable may have a
+    # mean other than zero. So the weights of the other variable must cancel the term.
     B0e = tableau.B0["W"].sum(axis=1)
-    moments = {"A1e": tableau.A1.sum(axis=1), "A1(B0e)": tableau.A1 @ B0e}
-    others = _conditions_on_other_variables(tableau.beta, moments)
-    third_moment = {"beta.A1((B0e)^2)": tableau.beta["W"] @ tableau.A1 @ B0e**2}
-    return first, second | third_moment | others
+    vectors = {
+        "A1e": tableau.A1.sum(axis=1),
+        "A1(B0e)": tableau.A1 @ B0e,
+        "A1((B0e)^2)": tableau.A1 @ B0e**2,
+    }
+    others = _conditions_on_other_variables(tableau.beta, vectors)
+    return first, second | others
 
 
 @_weak_conditions.register
-def _(tableau: AdditiveTableau) -> tuple[dict, dict]:
-    """For any number of noises, by sums over all independent random variables."""
+def _weak_conditions_additive(tableau: AdditiveTableau) -> tuple[dict, dict]:
+    """The conditions are for any number of noises. The random variables are taken to be
+    independent, with mean zero."""
     alpha = tableau.alpha
     Be = {name: B.sum(axis=1) for name, B in tableau.B.items()}
     first = {"alpha.e - 1": alpha.sum() - 1}
     for name, weights in tableau.beta.items():
-        # To first order the noise does not change in a step: its increment `W` counts once
-        # at the end, and every other variable not at all.
+        # To first order the noise is constant in a step. So the end of the step contains
+        # the increment `W` once, and every other variable not at all.
         exact = 1 if name == "W" else 0
         first[f"beta[{name}].e - {exact}"] = weights.sum() - exact
     sum_of_squares = sum(
@@ -341,9 +352,10 @@ def _(tableau: AdditiveTableau) -> tuple[dict, dict]:
 def _check_only_increment_drives_noise(tableau: GeneralTableau) -> None:
     """Raises a `ValueError` unless the increment alone drives the noise of a general
     tableau."""
-    # All variables share the weights. So another variable that multiplies the noise itself
-    # would add to the increment, and change all moments that the conditions are made of.
-    # Variables that multiply brackets are of higher order: their expectation is counted.
+    # All variables share the weights. So a second variable that multiplies the noise itself
+    # would add to the increment, and change the moments from which the conditions follow.
+    # Variables that multiply brackets are of higher order: the conditions include their
+    # means.
     noise_itself = [name for name in tableau.noise if drives(name) == "noise"]
     if noise_itself != ["W"]:
         raise ValueError(
@@ -354,21 +366,21 @@ def _check_only_increment_drives_noise(tableau: GeneralTableau) -> None:
 
 
 def _conditions_on_other_variables(
-    beta: Mapping[str, np.ndarray], moments: Mapping[str, np.ndarray]
+    beta: Mapping[str, np.ndarray], vectors: Mapping[str, np.ndarray]
 ) -> dict:
-    """The residuals of the conditions that the products of the weights `beta` of random
-    variables other than `W` with these `moments` vanish. Both are by name, and the result
-    by formula, such as `beta[H].e`."""
+    """Residuals of the conditions `beta[name].vector = 0`, for each random variable other
+    than `W`, with its weights `beta[name]`, and for each of the `vectors`, which are given
+    by their formulas."""
     residuals = {}
     for name, weights in beta.items():
         if name == "W":
             continue
-        for formula, moment in moments.items():
-            residuals[f"beta[{name}].{formula}"] = weights @ moment
+        for formula, vector in vectors.items():
+            residuals[f"beta[{name}].{formula}"] = weights @ vector
     return residuals
 
 
-# Only variables with a law of their own have one.
+# Random variables without a law of their own have no variance, and are left out.
 _VARIANCES = {
     name: variable.variance
     for name, variable in VARIABLES.items()
@@ -378,7 +390,7 @@ _VARIANCES = {
 
 def _variance(name: str) -> float:
     """The variance of a random variable of a step, in units of the step's size."""
-    # A tableau may have variables that are not known here, for a path of the user's own.
+    # A tableau for a user's path may have variables that are not known here.
     if name not in _VARIANCES:
         raise ValueError(
             "The conditions are known for the random variables "
@@ -388,7 +400,8 @@ def _variance(name: str) -> float:
     return _VARIANCES[name]
 
 
-# The channels whose controls change sign when a step is reversed.
+# The channels whose controls (the step size, or a random variable) change sign when a step
+# is reversed.
 _NEGATED_CHANNELS = {
     "h",
     *(name for name, variable in VARIABLES.items() if not variable.even),
@@ -396,18 +409,18 @@ _NEGATED_CHANNELS = {
 
 
 def is_own_inverse(tableau: FlatTableau) -> bool:
-    r"""Whether the method is reversible: the step with negated controls undoes the step.
-    This holds if stages can be paired, $i \leftrightarrow \sigma(i)$, such that
+    r"""Whether the method is reversible: the step with negated controls undoes the step. So
+    it does if stages can be paired, $i \leftrightarrow \sigma(i)$, such that
 
     $$a_{ij} + a_{\sigma(i)\sigma(j)} = b_j, \qquad b_{\sigma(j)} = b_j, \qquad
       c_i + c_{\sigma(i)} = 1,$$
 
-    with the matrix $a$, the weights $b$ and the times $c$ of the tableau: then stage $i$ of
+    with the matrix $a$, the weights $b$ and the times $c$ of the tableau. Then stage $i$ of
     the step is stage $\sigma(i)$ of the step back, at the same state and time.
     """
     channels = {name for stage in tableau.stages for name in stage.channels}
-    # Even random variables keep their sign in a step back, so that not all of its controls
-    # are negated.
+    # In the step back, even random variables keep their sign. With one of them, not all
+    # controls are negated.
     if not channels <= _NEGATED_CHANNELS:
         return False
 
@@ -419,14 +432,14 @@ def is_own_inverse(tableau: FlatTableau) -> bool:
         has_same_weight = np.isclose(tableau.weights[i], tableau.weights[j])
         return other.kind == stage.kind and bool(times_fit and has_same_weight)
 
-    # Few stages have more than one partner, so that few pairings are tried.
+    # Few stages have more than one possible partner, so few pairings are tried.
     numbers = range(len(tableau.stages))
     partners = [[j for j in numbers if may_be_partners(i, j)] for i in numbers]
     for sigma in itertools.product(*partners):
         # The partner of the partner of a stage is the stage.
         is_pairing = all(sigma[j] == i for i, j in enumerate(sigma))
-        # Entry `i, j` is a_ij + a_sigma(i)sigma(j) - b_j.
         matrix_of_partners = tableau.matrix[np.ix_(sigma, sigma)]
+        # Entry `i, j` is a_ij + a_sigma(i)sigma(j) - b_j.
         residuals = tableau.matrix + matrix_of_partners - tableau.weights
         # Coefficients of values that a stage does not read have no effect.
         residuals = np.where(tableau.reads_from, residuals, 0)

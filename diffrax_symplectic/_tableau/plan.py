@@ -1,5 +1,5 @@
-"""The plan of a step: which stages of a tableau to solve for or evaluate, and in which
-order. It is made before tracing."""
+"""The plan of a step: which stages of a tableau to solve for, which to evaluate, and in
+which order. It is made from coefficients alone, before tracing."""
 
 import dataclasses
 import functools as ft
@@ -14,12 +14,14 @@ from jaxtyping import Bool
 from .tableau import FlatTableau, Stage
 
 
-# Coefficients are exact up to a few roundings of numbers of order one.
+# Numbers that differ by less are taken to be equal: coefficients are exact up to a few
+# roundings of numbers of order one.
 _TOLERANCE = 1e-14
-# The smallest set of unknown stages of a block is found by trying all sets, up to a size
-# with more than this many choices. Twelve stages are always searched exhaustively. No
-# tableau of this package has a block with more than six, so the bound serves only to keep
-# an unusual tableau from taking minutes.
+# The smallest set of unknown stages of a block is found by trying all sets, the smallest
+# first. The search ends at a size for which there are more than this many sets. Blocks of
+# up to twelve stages are always searched exhaustively. No tableau of this package has a
+# block of more than six stages. The bound only keeps an unusual tableau from taking
+# minutes.
 _MOST_CHOICES = 1000
 
 
@@ -34,18 +36,18 @@ class Block(NamedTuple):
     graph.
 
     - `unknown`: the stages to solve for; none if the block is explicit.
-    - `explicit`: the other stages, ordered so that each follows from the unknown stages and
-        earlier ones.
+    - `explicit`: the other stages, ordered so that each depends only on the unknown stages
+        and on earlier explicit stages.
 
-    Both are in groups of stages that can be evaluated together.
+    Both consist of groups of stages that can be evaluated together.
     """
 
     unknown: tuple[Group, ...]
     explicit: tuple[Group, ...]
 
 
-# Compared by identity, which is fast and enough: `make_plan` makes equal plans only once,
-# unless more than its cache holds were made in between.
+# Plans are compared by identity, which is fast. It is enough, since `make_plan` returns the
+# same plan for equal tableaus, as long as its cache holds the plan.
 @dataclasses.dataclass(frozen=True, eq=False)
 class StepPlan:
     """The distinct stages that a tableau uses, in blocks to be solved in order."""
@@ -57,8 +59,8 @@ class StepPlan:
 def make_plan(tableau: FlatTableau) -> StepPlan:
     """The plan of a step: unused stages are dropped, equal ones merged, and the rest is
     ordered. Equal tableaus share one plan, the same object in every trace."""
-    # A plan is static data of a traced step, so that a new object would be a new trace.
-    # Arrays cannot be keys of a cache: the coefficients are passed as bytes.
+    # A plan is static data of a traced step, so a new plan would make JAX trace the step
+    # again. Arrays cannot be keys of a cache, so the coefficients are passed as bytes.
     return _make_plan(
         tableau.stages,
         np.asarray(tableau.matrix, np.float64).tobytes(),
@@ -66,37 +68,37 @@ def make_plan(tableau: FlatTableau) -> StepPlan:
     )
 
 
-# Solvers with free parameters have a tableau for each value of these, so that a search over
-# parameters would fill an unbounded cache.
+# A solver with free parameters has a tableau for each of their values. A search over
+# parameters would make an unbounded cache too large.
 @ft.lru_cache(maxsize=1024)
 def _make_plan(stages: tuple[Stage, ...], matrix: bytes, weights: bytes) -> StepPlan:
-    """`make_plan` for the stages and the coefficients, as bytes, of a tableau."""
+    """`make_plan` for a tableau with these stages and coefficients, given as bytes."""
     num_stages = len(stages)
     tableau = FlatTableau(
         stages=stages,
         matrix=np.frombuffer(matrix, np.float64).reshape(num_stages, num_stages),
         weights=np.frombuffer(weights, np.float64),
     )
-    # A coefficient counts as a dependency, also one of a value that a stage does not read.
+    # Below, every coefficient other than zero counts as a dependency. Coefficients of
+    # values that a stage does not read have no effect, and are set to zero.
     matrix_of_reads = np.where(tableau.reads_from, tableau.matrix, 0.0)
-    tableau = dataclasses.replace(tableau, matrix=_snapped(matrix_of_reads))
-    # Each of the three reductions can make more work for the others: stages may become
-    # equal once others were dropped, and weights may cancel once stages were merged. So
-    # they are repeated until no stage is lost.
-    num_before = None
-    while num_before is None or len(tableau.stages) < num_before:
+    tableau = dataclasses.replace(tableau, matrix=_with_exact_zeros(matrix_of_reads))
+    # Each of the three reductions may make others possible: weights may cancel when stages
+    # are merged, and columns may become equal when unused stages are dropped. So all three
+    # are repeated until no stage is lost.
+    while True:
         num_before = len(tableau.stages)
         tableau = _with_equal_stages_merged(tableau)
         tableau = _with_live_stages(tableau)
-        # This comes last, since a stage whose weight cancels would keep others from being
-        # merged.
+        # This comes last, since a stage with further channels is no longer equal to stages
+        # with its former channels.
         tableau = _with_channels_merged(tableau)
-    return StepPlan(tableau, _blocks(tableau))
+        if len(tableau.stages) == num_before:
+            return StepPlan(tableau, _blocks(tableau))
 
 
-def _snapped(x: np.ndarray | np.floating) -> np.ndarray:
-    """`x`, with numbers that are zero up to rounding set to zero: any other coefficient
-    counts as a dependency."""
+def _with_exact_zeros(x: np.ndarray | np.floating) -> np.ndarray:
+    """Sets numbers to zero that are zero up to rounding."""
     return np.where(np.abs(x) < _TOLERANCE, 0.0, x)
 
 
@@ -106,7 +108,7 @@ def _equal(x: np.ndarray | float, y: np.ndarray | float) -> bool:
 
 
 def _with_live_stages(tableau: FlatTableau) -> FlatTableau:
-    """The tableau with only the stages that the end of the step depends on."""
+    """The tableau with only the live stages, on which the end of the step depends."""
     depends = tableau.matrix != 0
     is_live = tableau.weights != 0
     # Each round adds the stages that live ones depend on. No chain of dependencies is
@@ -117,31 +119,32 @@ def _with_live_stages(tableau: FlatTableau) -> FlatTableau:
 
 
 def _with_equal_stages_merged(tableau: FlatTableau) -> FlatTableau:
-    """The tableau without stages that have the same value as another, because the same
-    channels (the controls that drive them) drive both at the same time and state. Their
-    coefficients are added."""
+    """The tableau with a single stage in place of stages of equal value. Two values are
+    equal if the stages have the same channels, and are evaluated at the same time and
+    state. The coefficients of the two stages are added."""
 
     def are_equal(i: int, j: int) -> bool:
         same_channels = tableau.stages[i].channels == tableau.stages[j].channels
         return same_channels and _same_evaluation(tableau, i, j)
 
-    # Pairs are merged one at a time, since the merged stage may equal another.
+    # Pairs are merged one at a time, since the merged stage may be equal to a third one.
     while pair := _first_pair(tableau, are_equal):
         i, j = pair
         matrix = tableau.matrix.copy()
         weights = tableau.weights.copy()
-        # A sum that should vanish may not in floating point: 0.1 + 0.2 - 0.3 is not 0.
-        matrix[:, i] = _snapped(matrix[:, i] + matrix[:, j])
-        weights[i] = _snapped(weights[i] + weights[j])
+        # In floating point a sum that should vanish may not: 0.1 + 0.2 - 0.3 is not 0.
+        matrix[:, i] = _with_exact_zeros(matrix[:, i] + matrix[:, j])
+        weights[i] = _with_exact_zeros(weights[i] + weights[j])
         with_sums = dataclasses.replace(tableau, matrix=matrix, weights=weights)
         tableau = _without(with_sums, j)
     return tableau
 
 
 def _with_channels_merged(tableau: FlatTableau) -> FlatTableau:
-    """The tableau with one stage, with the channels of both, in place of two that are
-    driven by different channels at the same time and state, and enter everything with the
-    same coefficients: its value is the sum of both."""
+    """The tableau with a single stage in place of two stages of which only the sum matters.
+    Such stages have different channels, are evaluated at the same time and state, and enter
+    all stages and the end of the step with the same coefficients. The single stage has the
+    channels of both, and its value is the sum."""
 
     def can_be_summed(i: int, j: int) -> bool:
         return (
@@ -151,7 +154,7 @@ def _with_channels_merged(tableau: FlatTableau) -> FlatTableau:
             and _equal(tableau.weights[i], tableau.weights[j])
         )
 
-    # Pairs are merged one at a time, since the merged stage may be merged with another.
+    # Pairs are merged one at a time, since the merged stage may be merged with a third one.
     while pair := _first_pair(tableau, can_be_summed):
         i, j = pair
         stages = list(tableau.stages)
@@ -164,14 +167,14 @@ def _with_channels_merged(tableau: FlatTableau) -> FlatTableau:
 def _first_pair(
     tableau: FlatTableau, may_be_merged: Callable[[int, int], bool]
 ) -> tuple[int, int] | None:
-    """The first pair of stages `i < j` with `may_be_merged(i, j)`, if there is one."""
+    """The first pair of stages `i < j` that may be merged, or `None`."""
     pairs = itertools.combinations(range(len(tableau.stages)), 2)
     return next((pair for pair in pairs if may_be_merged(*pair)), None)
 
 
 def _same_evaluation(tableau: FlatTableau, i: int, j: int) -> bool:
-    """Whether two stages evaluate their vector fields at the same time and state, for the
-    same part of the state."""
+    """Whether two stages evaluate their vector fields at the same time and state, and write
+    the same part of the state."""
     first = tableau.stages[i]
     second = tableau.stages[j]
     return (
@@ -186,8 +189,8 @@ def _without(tableau: FlatTableau, j: int) -> FlatTableau:
 
 
 def _blocks(tableau: FlatTableau) -> tuple[Block, ...]:
-    """The blocks of a step, the strongly connected components of the dependencies. Each
-    comes after the blocks that it depends on."""
+    """The blocks of a step: the strongly connected components of the dependencies. Each
+    block comes after the blocks on which it depends."""
     num_stages = len(tableau.stages)
     depends = tableau.matrix != 0
     # Entry `i, j` says whether a chain of dependencies leads from stage `i` to stage `j`.
@@ -200,8 +203,8 @@ def _blocks(tableau: FlatTableau) -> tuple[Block, ...]:
     components = {tuple(np.flatnonzero(row).tolist()) for row in is_mutual}
 
     def rank(component: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
-        # A block depends on fewer stages than any block that depends on it. Equal numbers
-        # are ordered by the numbers of the stages.
+        # A block depends on fewer stages than any block that depends on it. Blocks that
+        # depend on equally many stages are ordered by the numbers of their own stages.
         return int(reaches[component[0]].sum()), component
 
     ordered = sorted(components, key=rank)
@@ -211,19 +214,20 @@ def _blocks(tableau: FlatTableau) -> tuple[Block, ...]:
 def _as_block(
     component: tuple[int, ...], depends: _Dependencies, tableau: FlatTableau
 ) -> Block:
-    """The block of the stages `component`, which depend on each other."""
+    """The block that consists of the stages in `component`, which depend on each other."""
     numbers, rounds = _smallest_cut(component, depends)
     unknown = _groups(numbers, tableau)
     if len(unknown) > 1:
-        # Each group would unstack the values of the other groups again. Without stacking,
-        # an iteration of five stages takes a third less time.
+        # The values of a group are stacked, and each other group would unstack them again.
+        # So each unknown stage becomes a group: an iteration of five stages takes a third
+        # less time.
         unknown = tuple((i,) for group in unknown for i in group)
     explicit = [group for ready in rounds for group in _groups(ready, tableau)]
     return Block(unknown, tuple(explicit))
 
 
 def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
-    """These stages in groups that evaluate the same vector field."""
+    """Divides these stages into groups that evaluate the same vector field."""
     groups: dict[tuple[Any, ...], list[int]] = {}
     for i in stages:
         kind = tableau.stages[i].kind
@@ -234,9 +238,12 @@ def _groups(stages: Sequence[int], tableau: FlatTableau) -> tuple[Group, ...]:
 def _smallest_cut(
     block: tuple[int, ...], depends: _Dependencies
 ) -> tuple[tuple[int, ...], list[list[int]]]:
-    """The fewest stages of a block whose removal breaks all cycles of dependencies, and the
-    rounds in which the others can then be evaluated. If there are too many choices, all
-    stages: these equations have the same solution, but more of them are solved."""
+    """The fewest stages of a block whose removal breaks all cycles of dependencies; and the
+    rounds in which the other stages can then be evaluated, as from `_rounds`.
+
+    If there are too many choices, all stages of the block are removed. This leads to the
+    same solution, but more equations have to be solved than necessary.
+    """
     for size in range(len(block)):
         if math.comb(len(block), size) > _MOST_CHOICES:
             break
@@ -248,8 +255,8 @@ def _smallest_cut(
 
 
 def _rounds(stages: Sequence[int], depends: _Dependencies) -> list[list[int]] | None:
-    """Stages in rounds, each of which depends on no stage of its own or a later round.
-    `None` if they depend on each other in a cycle."""
+    """Divides these stages into rounds, so that no stage depends on a stage of its own or a
+    later round. `None` if there is a cycle of dependencies."""
     rounds = []
     remaining = list(stages)
     while remaining:

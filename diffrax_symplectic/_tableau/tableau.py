@@ -1,8 +1,8 @@
-"""Coefficients as data, in the notation of the paper.
+"""Coefficients as data, in the notation of the paper (Wang, Hong and Xu, 2017).
 
 A tableau of any family flattens to one square matrix and one vector of weights for all its
-stages, where each stage is one evaluation of a vector field. From these follow whether a
-method is symplectic, which stages are unused or equal, and the order of their solution.
+stages, where each stage is one evaluation of a vector field. The flat tableau shows whether
+a method is symplectic, which stages are unused or equal, and in which order to solve them.
 """
 
 import abc
@@ -21,7 +21,7 @@ from .._brownian import VARIABLES
 # - "separable": `H0 = V(p) + U(t, q)` and `H_k = U_k(t, q)`;
 # - "additive": noise independent of the state;
 # - "constant": noise independent of state and time;
-# - "separable and constant".
+# - "separable and constant": both.
 Structure: TypeAlias = Literal[
     "any", "separable", "additive", "constant", "separable and constant"
 ]
@@ -30,11 +30,12 @@ Structure: TypeAlias = Literal[
 class Stage(NamedTuple):
     """One evaluation, `y -> sum over channels of (vector field times control)`.
 
-    - `channels`: the controls that drive it: `"h"` for the drift; for noise the name of a
-        random variable, which is an attribute of the Brownian increment.
+    - `channels`: the names of the controls that drive the stage: `"h"`, the step size, for
+        the drift; for noise a random variable, an attribute of the Brownian increment.
     - `c`: the time of evaluation, as a fraction of the step.
-    - `reads`: the part of the state it depends on, `"y"` (all), `"p"`, `"q"` or `""`.
-    - `writes`: the part of the state it changes, `"y"`, `"p"` or `"q"`.
+    - `reads`: the part of the state that the stage depends on: `"y"` (all of it), `"p"`,
+        `"q"` or `""` (none).
+    - `writes`: the part of the state that the stage changes: `"y"`, `"p"` or `"q"`.
     """
 
     # Channels are names, not vector fields, so that a tableau can be made, compared and
@@ -50,10 +51,18 @@ class Stage(NamedTuple):
         return self.channels, self.reads, self.writes
 
 
+def _stages_at(
+    times: np.ndarray, channels: tuple[str, ...], *, reads: str, writes: str
+) -> list[Stage]:
+    """One stage at each of the `times`, which are fractions of the step."""
+    return [Stage(channels, float(c), reads, writes) for c in times]
+
+
 # Compared by identity, here and in the classes below, since `==` of arrays is an array.
 @dataclasses.dataclass(frozen=True, eq=False)
 class FlatTableau:
-    """Stage `i` is evaluated at `y0 + sum_j matrix[i, j] k_j`, with value `k_i`, and the
+    """All stages of a tableau, with one matrix and one vector of coefficients. Stage `i` is
+    evaluated at `y0 + sum_j matrix[i, j] k_j`, where `k_j` is the value of stage `j`. The
     step ends at `y0 + sum_i weights[i] k_i`."""
 
     stages: tuple[Stage, ...]
@@ -62,18 +71,19 @@ class FlatTableau:
 
     @property
     def reads_from(self) -> Bool[np.ndarray, "s s"]:
-        """Whether stage `i` reads a part of the state that stage `j` changes."""
-        # The stages of a tableau below write "p" or "q", or all of them write "y". So equal
-        # names suffice.
+        """Entry `i, j` says whether stage `i` reads the part of the state that stage `j`
+        writes."""
+        # It suffices to compare names: in the tableaus below, either all stages write "y",
+        # or each writes "p" or "q".
         rows = [
             [reader.reads == writer.writes for writer in self.stages]
             for reader in self.stages
         ]
-        # Without stages, NumPy does not know the second axis.
+        # If there are no stages, the list of rows has only one axis.
         return np.array(rows, bool).reshape(self.matrix.shape)
 
     def take(self, numbers: list[int]) -> "FlatTableau":
-        """The tableau with only the stages of these numbers, in this order."""
+        """The tableau with only the stages with these numbers, in this order."""
         return FlatTableau(
             stages=tuple(self.stages[i] for i in numbers),
             matrix=self.matrix[np.ix_(numbers, numbers)],
@@ -94,12 +104,12 @@ def _checked_coefficients(
     numbers in this shape."""
     array = np.asarray(value)
     # Strings and objects would fail later, with a message that does not name the
-    # coefficients; booleans are more likely a mistake than zeros and ones.
+    # coefficients. Booleans are more likely a mistake than meant as zeros and ones.
     if array.dtype.kind not in "iuf":
         raise ValueError(
             f"Coefficients `{name}` must be real numbers; got dtype {array.dtype}."
         )
-    # Always in double precision: a plan decides by comparing coefficients, and must not
+    # Coefficients always have double precision: plans compare coefficients, and must not
     # depend on the precision of a solve.
     array = array.astype(np.float64)
     if array.shape != shape:
@@ -122,8 +132,8 @@ class AbstractTableau(abc.ABC):
     """
 
     structure: ClassVar[Structure]
-    # The axes of each field of coefficients: those named by the same letter are over the
-    # same stages.
+    # The axes of each field of coefficients, one letter for each axis. Axes with the same
+    # letter are over the same kind of stages, and have the same length.
     _axes: ClassVar[dict[str, str]] = {}
     # Fields that may hold a dictionary from names of random variables to coefficients.
     _by_variable: ClassVar[tuple[str, ...]] = ()
@@ -131,16 +141,17 @@ class AbstractTableau(abc.ABC):
     def __post_init__(self):
         """Replaces coefficients by checked, read-only arrays. Raises a `ValueError` for
         wrong shapes, or numbers that are not real and finite."""
-        # Each kind of stages is counted in the first field that cannot be a dictionary and
-        # has its axis first.
-        num_stages = {}
+        # The length that belongs to a letter is taken from the first field that cannot be a
+        # dictionary and whose first axis has the letter. (A number in place of a vector has
+        # size 1. Its shape is refused below.)
+        lengths = {}
         for name, axes in self._axes.items():
             if name not in self._by_variable:
                 value = getattr(self, name)
                 length = np.size(value) if len(axes) == 1 else len(value)
-                num_stages.setdefault(axes[0], length)
+                lengths.setdefault(axes[0], length)
         for name, axes in self._axes.items():
-            shape = tuple(num_stages[axis] for axis in axes)
+            shape = tuple(lengths[axis] for axis in axes)
             value = getattr(self, name)
             if name in self._by_variable:
                 arrays = value if isinstance(value, Mapping) else {"W": value}
@@ -163,11 +174,17 @@ class AbstractTableau(abc.ABC):
 def _side_by_side(
     B: Mapping[str, np.ndarray], beta: Mapping[str, np.ndarray], shape: tuple[int, int]
 ) -> tuple[list[str], Float[np.ndarray, "s n"], Float[np.ndarray, " n"]]:
-    """The names of all random variables that have coefficients in `B`, of this `shape`, or
-    `beta`; and the coefficients of all of them, concatenated along the last axis. Variables
-    without coefficients have zeros."""
-    # A dictionary keeps the order of first appearance. That of a set would differ from run
-    # to run.
+    """The coefficients of all random variables side by side. Returns
+
+    - the names of the variables that have coefficients in `B` or in `beta`;
+    - the matrices `B` of these variables, concatenated along the last axis;
+    - the vectors `beta` of these variables, concatenated.
+
+    A variable that is missing from `B` or `beta` has zeros there. `shape` is the shape of
+    the matrix of one variable.
+    """
+    # A dictionary keeps the order of first appearance. The order of a set would differ from
+    # run to run.
     variables = list(dict.fromkeys([*B, *beta]))
     zeros = np.zeros(shape)
     all_B = [B.get(variable, zeros) for variable in variables]
@@ -222,7 +239,7 @@ class GeneralTableau(AbstractTableau):
     noise: tuple[str, ...] = ("W",)
 
     def __post_init__(self):
-        # A string is a sequence of strings, too: `noise="W"` would pass the second test.
+        # A string is a sequence of strings. So `noise="W"` would pass the second test.
         is_string = isinstance(self.noise, str)
         if is_string or not all(isinstance(name, str) for name in self.noise):
             raise ValueError(
@@ -250,10 +267,10 @@ class GeneralTableau(AbstractTableau):
         return cls(alpha=alpha, beta=beta, A0=A, B0=B, A1=A, B1=B)
 
     def flatten(self) -> FlatTableau:
-        drift = [Stage(("h",), float(c0), "y", "y") for c0 in self.A0.sum(axis=1)]
-        # The two numbers of stages differ in general, so drift and noise are never one
-        # stage here. The plan of a step merges those that are evaluated at one point.
-        noise = [Stage(self.noise, float(c1), "y", "y") for c1 in self.A1.sum(axis=1)]
+        # Drift and noise have separate stages, since their numbers may differ. The plan of
+        # a step merges stages that are evaluated at the same time and state.
+        drift = _stages_at(self.A0.sum(axis=1), ("h",), reads="y", writes="y")
+        noise = _stages_at(self.A1.sum(axis=1), self.noise, reads="y", writes="y")
         return FlatTableau(
             stages=(*drift, *noise),
             matrix=np.block([[self.A0, self.B0], [self.A1, self.B1]]),
@@ -301,8 +318,8 @@ class SeparableTableau(AbstractTableau):
     A1: Coefficients
 
     def partitioned(self) -> "PartitionedTableau":
-        """The same method, with the coefficients of the velocities listed, too: here they
-        are those of the forces."""
+        """The same method as a `PartitionedTableau`. Here the coefficients for velocities
+        are equal to those for forces."""
         return PartitionedTableau(
             alpha=self.alpha,
             alpha_hat=self.alpha,
@@ -355,30 +372,30 @@ class PartitionedTableau(AbstractTableau):
         num_velocities, num_forces = self.A.shape
         shape = (num_velocities, len(self.A1))
         variables, B0, beta = _side_by_side(self.B0, self.beta, shape)
-        # Forces come first: a plan tries to take the first stages for its unknowns, and
-        # forces cost more to evaluate than velocities.
-        forces = [Stage(("h",), float(c), "q", "p") for c in self.A_hat.sum(axis=1)]
+        # Forces come first: a plan prefers the first stages as unknowns, and forces cost
+        # more to evaluate than velocities.
+        forces = _stages_at(self.A_hat.sum(axis=1), ("h",), reads="q", writes="p")
         # Velocities do not depend on time. All have the same time, so that a plan can merge
         # velocities at equal momenta.
-        velocities = [Stage(("h",), 0.0, "p", "q")] * num_velocities
-        noise = [
-            Stage((variable,), float(c1), "q", "p")
-            for variable in variables
-            for c1 in self.A1.sum(axis=1)
-        ]
-        # Momenta, at which velocities are evaluated, depend on forces and noise; positions
-        # on velocities.
+        zeros = np.zeros(num_velocities)
+        velocities = _stages_at(zeros, ("h",), reads="p", writes="q")
+        # Each random variable has noise stages of its own, all at the same times and
+        # positions.
+        noise = []
+        noise_times = self.A1.sum(axis=1)
+        for variable in variables:
+            noise += _stages_at(noise_times, (variable,), reads="q", writes="p")
         stages = (*forces, *velocities, *noise)
+        force_numbers = slice(0, num_forces)
+        velocity_numbers = slice(num_forces, num_forces + num_velocities)
+        noise_numbers = slice(num_forces + num_velocities, len(stages))
         matrix = np.zeros((len(stages), len(stages)))
-        of_forces = slice(0, num_forces)
-        of_velocities = slice(num_forces, num_forces + num_velocities)
-        of_noise = slice(num_forces + num_velocities, len(stages))
-        matrix[of_forces, of_velocities] = self.A_hat
-        matrix[of_velocities, of_forces] = self.A
-        matrix[of_velocities, of_noise] = B0
-        # Each random variable has noise stages of its own, all at the same points: the
-        # velocities enter those of each variable in the same way.
-        matrix[of_noise, of_velocities] = np.tile(self.A1, (len(variables), 1))
+        # Forces and noise are evaluated at positions, which depend on velocities.
+        matrix[force_numbers, velocity_numbers] = self.A_hat
+        matrix[noise_numbers, velocity_numbers] = np.tile(self.A1, (len(variables), 1))
+        # Velocities are evaluated at momenta, which depend on forces and noise.
+        matrix[velocity_numbers, force_numbers] = self.A
+        matrix[velocity_numbers, noise_numbers] = B0
         return FlatTableau(
             stages=stages,
             matrix=matrix,
@@ -426,15 +443,13 @@ class AdditiveTableau(AbstractTableau):
     def flatten(self) -> FlatTableau:
         shape = (len(self.alpha), len(self.c1))
         variables, B, beta = _side_by_side(self.B, self.beta, shape)
-        drift = [Stage(("h",), float(c0), "y", "y") for c0 in self.A.sum(axis=1)]
-        # Noise stages read no part of the state, so they are evaluated once in a step, not
-        # in every iteration of the root finder.
-        noise = [
-            Stage((variable,), float(c1), "", "y")
-            for variable in variables
-            for c1 in self.c1
-        ]
-        # Noise stages depend on no stage.
+        drift = _stages_at(self.A.sum(axis=1), ("h",), reads="y", writes="y")
+        # Noise stages read no part of the state. So they are evaluated once in a step, and
+        # not in every iteration of the root finder.
+        noise = []
+        for variable in variables:
+            noise += _stages_at(self.c1, (variable,), reads="", writes="y")
+        # Noise stages depend on no other stage.
         noise_rows = np.zeros((len(noise), len(drift) + len(noise)))
         return FlatTableau(
             stages=(*drift, *noise),

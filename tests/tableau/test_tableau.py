@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from typing import ClassVar
 
 import diffrax
 import jax
@@ -193,3 +194,39 @@ def test_strong_order_three_halves_has_no_place_for_further_variables():
         [1], {"W": [1], "sign": [1]}, [[0.5]], {"W": [[0.5]]}, [0.5]
     )
     assert ds.strong_order_residuals(in_time)["beta[sign].c1"] == 0.5
+
+
+def test_weights_of_the_increment_need_no_condition_with_its_third_power():
+    """Its term is odd in `W`, so it has no mean at weak order 2. Other variables are
+    functions of `W`: there it counts."""
+    d = np.sqrt(3 / 8)
+    total = -1.0
+    first = (total - 1 / (4 * d)) / 2
+    odd = ds.SeparableTableau(
+        alpha=[1 / 3] * 3,
+        beta=[1.0],
+        A0=np.full((3, 3), 1 / 6),
+        B0=[[1 / 2 + d], [1 / 2], [1 / 2 - d]],
+        A1=[[first, 1 / 2 - total, total - first]],
+    )
+    third_power = odd.beta["W"] @ odd.A1 @ odd.B0["W"].sum(axis=1) ** 2
+    assert abs(third_power) > 0.3
+    assert np.max(np.abs([*ds.weak_order_residuals(odd, 2).values()])) < 1e-14
+
+    class Method(ds.AbstractSymplecticRungeKutta, ds.AbstractImplicitStages):
+        tableau: ClassVar[ds.SeparableTableau] = odd
+
+    H0 = lambda t, p, q, args: jnp.sqrt(1 + p**2) + p**3 / 5 + jnp.cos(q)
+    noise = lambda t, p, q, args: jnp.sin(q) + q**2 / 3
+    path = ds.WeakBrownianPath((), jax.random.key(0))
+    terms = ds.hamiltonian_terms(H0, noise, path)
+    y0 = jnp.array(0.3), jnp.array(0.7)
+    defect = lambda h: ds.weak_order_defect(
+        terms, Method(), 0, h, y0, fn=lambda t, y, args: y[0] * y[1] ** 2, order=2
+    )
+    coarse, fine = jax.vmap(defect)(jnp.array([0.01, 0.005]))
+    # A step's error of the third order.
+    assert np.log2(abs(coarse / fine)) > 2.9
+    others = odd.beta | {"sqrt": [1.0]}
+    with_sqrt = dataclasses.replace(odd, beta=others)
+    assert "beta[sqrt].A1((B0e)^2)" in ds.weak_order_residuals(with_sqrt, 2)
