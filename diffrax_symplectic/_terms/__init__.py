@@ -5,20 +5,22 @@ What users call:
 
 - `hamiltonian`: `hamiltonian_terms` and `noise_terms`.
 - `langevin`: `langevin_terms` and `bath_terms`; a folder.
-- `spins`, `waves`: `spin_terms` and `wave_terms`, Hamiltonians of another variable, which
-  `lifted` makes of `(p, q)`.
+- `spins`, `waves`: `spin_terms` and `wave_terms`, for Hamiltonians of another variable.
+  `lifted` makes Hamiltonians of `(p, q)` from these.
 - `ito`: `ito_drift`, for noise in the sense of Ito.
-- `constraint`: `constrained_state`, and the surface that a constraint leaves; a folder.
+- `constraint`: `constrained_state`, and the surface of the positions that a constraint
+  allows; a folder.
 
 What solvers and expectations ask of terms, from the bottom up:
 
 - `paths`: the Brownian paths that terms hold.
 - `dependence`: which inputs the results of a function depend on.
-- `callers`: programs in place of the user's functions.
 - `evaluation`: calls of the user's functions, with advice on their errors.
+- `callers`: which functions of the user terms hold, and traced programs in their place.
 - `constrained_drift`: the drift of a system with a constraint.
 - `symplectic_gradients`: the vector fields of Hamiltonians.
-- `drift_and_noise`: which terms are drifts, which are noises, and drifts taken apart.
+- `drift_and_noise`: which terms are drifts, which are noises, and drifts split into energy,
+  friction and slow potential.
 - `vector_fields`: vector fields times controls.
 - `step_variables`: the random variables of a step and their laws.
 - `structure`: whether a system has the structure that a solver needs, and what is wrong

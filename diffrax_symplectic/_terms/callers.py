@@ -1,4 +1,8 @@
-"""The user's functions in terms, and terms with programs in their place."""
+"""The functions of the user that terms and solvers hold, and their programs in their place.
+
+The program of a function is a `Traced`: what the function computed when it was traced. It
+is found again by what it computes, as the module `_programs` says.
+"""
 
 import abc
 from collections.abc import Callable, Iterator
@@ -27,13 +31,16 @@ class AbstractCaller(eqx.Module):
     def called_with(
         self, t: RealScalarLike, y: Y, args: Args
     ) -> dict[str, tuple[Any, ...]]:
-        """What a solve of the state `y` calls the functions in these fields with, in arrays
-        or their shapes. A field may hold a constant in place of a function."""
+        """For each field that may hold a function of the user, by name, the inputs of the
+        function in a solve of the state `y`. An input may be given by the shapes of its
+        arrays."""
 
 
-# What holds functions of the user and calls them. These are no functions of the user
-# themselves, also where they stand in place of one, such as a `Drift` in an `ODETerm`.
+# The classes of what holds functions of the user and calls them, here called parts. Some
+# parts can be called themselves, such as the `Drift` in an `ODETerm`.
 _PARTS = AbstractCaller, diffrax.AbstractTerm, diffrax.AbstractSolver
+# Terms for which `_inputs_of_functions` knows the fields that hold functions. Any other
+# term is of a class of the user's.
 _KNOWN_TERMS = (
     AbstractCaller,
     diffrax.ODETerm,
@@ -45,32 +52,36 @@ _KNOWN_TERMS = (
 
 
 def with_programs(terms: _T, t: RealScalarLike, y: Y, args: Args) -> _T:
-    """The terms, or a solver, with each function of the user replaced by a program of what
-    it computes now. Functions that compute the same have equal programs, so what JAX has
-    compiled for the terms that are returned serves for all such functions. Raises what the
-    functions raise for such a state, and a `ValueError` for a state that is no pair where
-    the terms need one."""
+    """The terms, or a solver, with each function of the user replaced by its program.
+
+    Functions that compute the same have equal programs. So what JAX has compiled for the
+    returned terms also serves for other functions that compute the same.
+
+    Raises what the functions raise for a state like `y`. Also raises a `ValueError` if the
+    terms are those of a Hamiltonian system, and `y` is not a pair `(p, q)`."""
     y = jtu.tree_map(jnp.asarray, y)
     t = jnp.asarray(t, jnp.result_type(*jtu.tree_leaves(y)))
+    # What takes the place of each function, or term of the user's class, by its `id`. A
+    # function that several parts hold, such as the energy of a heat bath, is traced once.
     programs: dict[int, Any] = {}
     for part in _parts(terms):
         if isinstance(part, AbstractCaller):
             check_pair(y)
         is_term = isinstance(part, diffrax.AbstractTerm)
         if is_term and not isinstance(part, _KNOWN_TERMS):
-            # A term of a class of the user's.
             control = eqx.filter_eval_shape(part.contr, t, t)
             programs[id(part)] = _TracedTerm(
-                part,
-                _traced_field(part.vf, t, y, args, identity=part),
-                traced(part.vf_prod, t, y, args, control, identity=part),
+                term=part,
+                field=_traced_field(part.vf, t, y, args, identity=part),
+                product=traced(part.vf_prod, t, y, args, control, identity=part),
             )
         trace = _traced_field if isinstance(part, diffrax.ControlTerm) else traced
-        for name, inputs in _called_with(part, t, y, args).items():
+        for name, inputs in _inputs_of_functions(part, t, y, args).items():
             fn = getattr(part, name)
-            # A function may stand in several places, as the energy of a heat bath does. It
-            # is traced once.
-            if callable(fn) and not isinstance(fn, _PARTS) and id(fn) not in programs:
+            # The field may hold a constant, such as a friction, or an inner part.
+            is_function = callable(fn) and not isinstance(fn, _PARTS)
+            if is_function and id(fn) not in programs:
+                # Errors while the function is traced come with advice.
                 call = jtu.Partial(_call, name, fn)
                 programs[id(fn)] = trace(call, *inputs, identity=fn)
 
@@ -81,7 +92,7 @@ def with_programs(terms: _T, t: RealScalarLike, y: Y, args: Args) -> _T:
 
 
 def _parts(tree: PyTree) -> Iterator[Any]:
-    """All parts of terms or of a solver, also those within others."""
+    """All parts of terms or of a solver, also those within other parts."""
 
     def is_inner_part(x: Any) -> bool:
         return x is not tree and isinstance(x, _PARTS)
@@ -93,10 +104,11 @@ def _parts(tree: PyTree) -> Iterator[Any]:
             yield from _parts(leaf)
 
 
-def _called_with(
+def _inputs_of_functions(
     part: Any, t: RealScalarLike, y: Y, args: Args
 ) -> dict[str, tuple[Any, ...]]:
-    """As `AbstractCaller.called_with`, for any part."""
+    """For each field of a part that may hold a function of the user, by name, the inputs of
+    the function. Empty if the part has no such field."""
     if isinstance(part, AbstractCaller):
         return part.called_with(t, y, args)
     if isinstance(part, diffrax.ODETerm | diffrax.ControlTerm):
@@ -118,18 +130,16 @@ def _call(name: str, fn: Callable, *inputs: Any) -> PyTree[Array]:
 def _traced_field(
     fn: Callable, t: RealScalarLike, y: Y, args: Args, identity: Any
 ) -> Callable:
-    """The program of a vector field that may return a Lineax operator."""
+    """The program of a vector field, whose value may be a Lineax operator."""
     field = eqx.filter_eval_shape(fn, t, y, args)
     if not isinstance(field, lx.AbstractLinearOperator):
         return traced(fn, t, y, args, identity=identity)
     struct = field.in_structure()
-
-    # A program returns arrays alone, and an operator may hold a function. So the program is
-    # that of the product of the operator with a control.
+    # A program only returns arrays, and an operator may hold a function. So the product of
+    # the operator with a control is traced.
     product = jtu.Partial(_product, fn)
-    return _OperatorField(
-        traced(product, t, y, args, struct, identity=identity), struct
-    )
+    program = traced(product, t, y, args, struct, identity=identity)
+    return _OperatorField(program, struct)
 
 
 def _product(fn: Callable, *inputs: Any) -> Y:
@@ -139,7 +149,11 @@ def _product(fn: Callable, *inputs: Any) -> Y:
 
 
 class _OperatorField(eqx.Module):
-    """A vector field whose values are Lineax operators."""
+    """A vector field whose values are Lineax operators.
+
+    - `product`: the program of the operator times a control.
+    - `struct`: the shapes and dtypes of the control.
+    """
 
     product: Traced
     struct: PyTree = eqx.field(static=True)
@@ -152,10 +166,10 @@ class _OperatorField(eqx.Module):
 
 
 class _TracedTerm(diffrax.AbstractTerm):
-    """A term of a class of the user's.
+    """A term of a class of the user's, with programs of its methods.
 
-    - `term`: the term, which gives the control.
-    - `field`, `product`: its methods `vf` and `vf_prod`.
+    - `term`: the term itself, which gives the control.
+    - `field`, `product`: the programs of its methods `vf` and `vf_prod`.
     """
 
     term: diffrax.AbstractTerm

@@ -17,7 +17,7 @@ from .callers import AbstractCaller
 _T = TypeVar("_T")
 Constraint = Callable[[PyTree, Args], Float[Array, " c"]]
 
-# The advice of every refusal. These two solvers find the multipliers of a constraint.
+# The advice of every error. These two solvers find the multipliers of a constraint.
 KEEP = (
     "Use `StormerVerlet()`, or for the terms of `langevin_terms` `BAOAB()`: they keep the "
     "constraint to rounding"
@@ -27,9 +27,9 @@ KEEP = (
 class ConstrainedDrift(diffrax.AbstractTerm, AbstractCaller):
     """The drift of Hamiltonians for positions with `constraint(q, args) = 0`.
 
-    Its vector field depends on multipliers, which only some solvers find. These read the
-    fields of the term. All others, also those of Diffrax, ask for the product of the vector
-    field with the length of a step, which raises an error.
+    Its vector field depends on multipliers, which only some solvers find. Those solvers
+    read `drift` and `constraint`. All other solvers, also those of Diffrax, ask for the
+    product of the vector field with the length of a step, which raises an error.
     """
 
     drift: diffrax.AbstractTerm
@@ -43,8 +43,9 @@ class ConstrainedDrift(diffrax.AbstractTerm, AbstractCaller):
         return {"constraint": (q, args)}
 
     def vf(self, t, y, args) -> PyTree[Array]:
-        # Diffrax looks at the structure of the vector field before any solve, so the error
-        # cannot be raised here. The values must not be used, hence NaN.
+        # An error here would come before any solve, also of the solvers that find the
+        # multipliers: Diffrax looks at the structure of the vector field. Its values must
+        # not be used, hence NaN.
         return jtu.tree_map(lambda x: jnp.full_like(x, jnp.nan), y)
 
     def contr(self, t0, t1, **kwargs) -> Any:
@@ -67,7 +68,7 @@ def with_constraint(
 def constraint_of(terms: PyTree[diffrax.AbstractTerm]) -> Constraint | None:
     """The constraint of these terms, if there is one. Raises a `ValueError` if there are
     several."""
-    # The drift may be within a `MultiTerm`, and within Diffrax's wrapper for the direction
+    # `parts_of` also looks into a `MultiTerm`, and into Diffrax's wrapper for the direction
     # of time.
     constraints = [term.constraint for term in parts_of(ConstrainedDrift, terms)]
     # The multipliers of all constraints belong to one equation: a step that keeps one

@@ -1,4 +1,4 @@
-"""Detects which inputs the results of a function depend on."""
+"""Detects which inputs the results of a function depend on, from its program in JAX."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -11,12 +11,12 @@ from .._compat import ClosedJaxpr, dce_jaxpr, Jaxpr, Literal, results_of_program
 
 
 class Dependence:
-    """The dependencies of `fn(*inputs)`, traced once: its results do not depend on inputs
-    that JAX's dead-code elimination removes.
+    """Which inputs the results of `fn(*inputs)` depend on. `fn` is traced once.
 
-    This holds for all values of the inputs. The converse does not hold: variables that
-    cancel, as in `x - x`, or are multiplied by zero count as read. Arrays are tracked as a
-    whole, not entry by entry.
+    A result does not depend on an input that JAX's dead-code elimination removes from the
+    program for this result. That holds for all values of the inputs. The converse does not
+    hold: inputs that cancel, as in `x - x`, or that are multiplied by zero count as read.
+    Arrays are tracked as a whole, not entry by entry.
     """
 
     def __init__(self, fn: Callable, *inputs: PyTree):
@@ -25,19 +25,21 @@ class Dependence:
         self._inputs = inputs
 
     def independent(self, of: Callable, part: Callable = lambda out: out) -> bool:
-        """Whether `part(result)` is independent of `of(*inputs)`, PyTrees of arrays."""
+        """Whether the arrays `part(result)` are independent of the arrays `of(*inputs)`."""
         is_in_part = _which_are_selected(part, self._out)
-        # A program for these results alone reads fewer inputs.
+        # The program for these results alone may read fewer inputs than the whole one.
         _, is_read = dce_jaxpr(self._jaxpr, is_in_part)
         is_asked = _which_are_selected(lambda inputs: of(*inputs), self._inputs)
         return not any(read and asked for read, asked in zip(is_read, is_asked))
 
 
 def _without_powers_of_zero(jaxpr: Jaxpr) -> Jaxpr:
-    """The program, in which `x**0` does not read `x`, nor in the programs that it calls. In
-    some versions of JAX the second derivative of `x**2` contains it."""
+    """The program with `1**0` in place of `x**0`, also within the programs that it calls.
 
-    def reads_less(eqn: Any) -> Any:
+    In some versions of JAX the second derivative of `x**2` contains `x**0`, by which it
+    would seem to depend on `x`."""
+
+    def without_power(eqn: Any) -> Any:
         if eqn.primitive.name == "integer_pow" and eqn.params["y"] == 0:
             (operand,) = eqn.invars
             return eqn.replace(invars=[Literal(1.0, operand.aval)])
@@ -47,7 +49,7 @@ def _without_powers_of_zero(jaxpr: Jaxpr) -> Jaxpr:
             return eqn.replace(params=eqn.params | {"jaxpr": called})
         return eqn
 
-    return jaxpr.replace(eqns=[reads_less(eqn) for eqn in jaxpr.eqns])
+    return jaxpr.replace(eqns=[without_power(eqn) for eqn in jaxpr.eqns])
 
 
 def _which_are_selected(select: Callable, tree: PyTree) -> list[bool]:
@@ -59,17 +61,19 @@ def _which_are_selected(select: Callable, tree: PyTree) -> list[bool]:
     return [number in selected_numbers for number in range(treedef.num_leaves)]
 
 
-# Operations that may act on what is linear in an input, entry by entry. All others count
-# as mixing entries: a list of those that mix would grow with each release of JAX.
+# Operations that act entry by entry, as far as they occur in functions that are linear in
+# an input. All others count as mixing entries, since a list of operations that mix entries
+# would grow with each release of JAX.
 _ELEMENTWISE = frozenset(
     "add add_any convert_element_type copy div integer_pow mul neg select_n sub".split()
 )
-# Operations whose parameters hold the program that they call.
+# Operations that call another program, which is one of their parameters.
 _CALLS = frozenset({"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"})
 
 
 class _Source:
-    """An input. Values that are no `_Source` depend on no input."""
+    """Stands for an input, as the source of the values that depend on it entry by entry.
+    Any other object in the place of a source stands for no input."""
 
 
 class _MixesEntries(Exception):
@@ -77,8 +81,9 @@ class _MixesEntries(Exception):
 
 
 def acts_elementwise(fn: Callable, x: PyTree[Array]) -> bool:
-    """Whether each entry of `fn(x)`, in the structure of `x`, is known to depend on the
-    same entry of `x` alone. Then its derivative is diagonal. The converse does not hold."""
+    """Whether each entry of `fn(x)`, in the structure of `x`, is known to depend only on
+    the same entry of `x`, so that the derivative is diagonal. If false, it may be so all
+    the same."""
     closed = jax.make_jaxpr(fn)(x)
     inputs = [_Source() for _ in closed.jaxpr.invars]
     try:
@@ -86,17 +91,22 @@ def acts_elementwise(fn: Callable, x: PyTree[Array]) -> bool:
     except _MixesEntries:
         return False
     pairs = zip(inputs, results)
-    return all(result is x or not isinstance(result, _Source) for x, result in pairs)
+    # A derivative is also diagonal if it is zero, for a result without a source.
+    return all(
+        result is own or not isinstance(result, _Source) for own, result in pairs
+    )
 
 
 def _sources_of_results(program: Any, sources: Sequence[Any]) -> list[Any]:
-    """For each result of a program the input whose entries its own depend on, each on the
-    same entry; no `_Source` if it depends on no input. Raises `_MixesEntries` if it depends
-    on inputs in any other way. `sources` are those of the inputs of the program."""
+    """The source of each result of a program, for the `sources` of its inputs.
+
+    A source is the input on which a value depends, each entry of the value on the same
+    entry of the input. Raises `_MixesEntries` if a result depends on inputs in any other
+    way."""
     # Some operations hold the program with its constants, others without them.
     jaxpr = getattr(program, "jaxpr", program)
-    # Operations that no result needs are left out, since they may mix entries: the
-    # derivative of a product of all entries also computes the product.
+    # Operations that no result needs are left out, since they may mix entries. The gradient
+    # of `sum(x**2)` also computes the sum, for example.
     jaxpr, read_inputs = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
     read_sources = [source for source, is_read in zip(sources, read_inputs) if is_read]
     closed = ClosedJaxpr(jaxpr, getattr(program, "consts", []))
@@ -104,7 +114,7 @@ def _sources_of_results(program: Any, sources: Sequence[Any]) -> list[Any]:
 
 
 def _sources_of_operation(eqn: Any, sources: list[Any]) -> list[Any]:
-    """`_sources_of_results` for one operation."""
+    """The source of each result of one operation, as `_sources_of_results` has it."""
     distinct = {source for source in sources if isinstance(source, _Source)}
     if len(distinct) == 0:
         return [None for _ in eqn.outvars]
@@ -118,7 +128,7 @@ def _sources_of_operation(eqn: Any, sources: list[Any]) -> list[Any]:
 
 
 def _is_elementwise(eqn: Any, sources: list[Any]) -> bool:
-    """Whether an operation keeps the entries of those arguments that have a source."""
+    """Whether an operation acts entry by entry on those arguments that have a source."""
     shape = eqn.outvars[0].aval.shape
     pairs = zip(eqn.invars, sources)
     tracked = [x for x, source in pairs if isinstance(source, _Source)]
@@ -127,7 +137,7 @@ def _is_elementwise(eqn: Any, sources: list[Any]) -> bool:
     if eqn.primitive.name == "dot_general":
         # A product with a single number, as in the derivative of `p @ p`, sums no entries.
         return len(tracked) == 1 and any(x.aval.size == 1 for x in eqn.invars)
-    # These two keep the entries if they keep the shape, as they do here.
+    # These two act entry by entry if they keep the shape, as they do here.
     if eqn.primitive.name in ("reshape", "broadcast_in_dim"):
         return True
     return eqn.primitive.name in _ELEMENTWISE

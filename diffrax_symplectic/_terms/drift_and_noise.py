@@ -1,5 +1,5 @@
-"""The terms of a system one by one: which are drifts, which are noises, and how many noises
-there are; and drifts taken apart."""
+"""The terms of a system, sorted into drifts and noises, and drifts taken apart into energy,
+friction and slow potential."""
 
 import dataclasses
 from typing import Any
@@ -27,8 +27,10 @@ _BACKSOLVE = (
 
 
 def split_terms(terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
-    """Drift terms and noise terms. A term is noise if it has a Brownian path, or if it is
-    neither the first term nor an `ODETerm`.
+    """The drift terms and the noise terms.
+
+    A term is noise if it has a Brownian path. A term without one is a drift if it is the
+    first term or an `ODETerm`, constrained or not, and otherwise noise.
 
     Raises a `ValueError` for the terms of `diffrax.BacksolveAdjoint`."""
     parts = flattened(terms)
@@ -37,8 +39,8 @@ def split_terms(terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
     drift = []
     noise = []
     for place, term in enumerate(parts):
-        # A term of another kind after the first may be driven by a path that Diffrax knows
-        # nothing of. It must not pass for a drift: most solvers treat noise differently.
+        # A term of the user's own class may be driven by a path that is not a Brownian path
+        # of Diffrax. It must not pass for a drift: most solvers treat noise differently.
         is_ode = isinstance(unwrapped(term), diffrax.ODETerm | ConstrainedDrift)
         if len(brownian_paths(term)) > 0 or (place > 0 and not is_ode):
             noise.append(term)
@@ -55,8 +57,8 @@ def flattened(terms: diffrax.AbstractTerm) -> Terms:
 
 
 def field_of(term: diffrax.AbstractTerm) -> Any:
-    """The vector field of an `ODETerm`, also of one that Diffrax has wrapped; `None` for
-    other terms."""
+    """The vector field of an `ODETerm`, which Diffrax may have wrapped to run backward in
+    time; `None` for other terms."""
     term = unwrapped(term)
     return term.vector_field if isinstance(term, diffrax.ODETerm) else None
 
@@ -73,9 +75,10 @@ def split_friction(terms: PyTree[diffrax.AbstractTerm]) -> tuple[Terms, Terms, T
 
 
 def friction_apart(drift: Terms) -> tuple[Terms, Terms]:
-    """The drift without friction, and the friction. A term may be a drift with friction, as
-    from `langevin_terms`, which is taken apart; friction alone, as from `bath_terms`; or a
-    drift without friction."""
+    """The terms of the drift without friction, and the terms of the friction.
+
+    A term of `drift` may be a drift with friction, as from `langevin_terms`, which becomes
+    two terms; friction alone, as from `bath_terms`; or a drift without friction."""
     rest = []
     friction = []
     for term in drift:
@@ -92,8 +95,8 @@ def friction_apart(drift: Terms) -> tuple[Terms, Terms]:
 
 
 def slow_apart(drift: Terms) -> tuple[Terms, Terms]:
-    """The terms of the drift without their slow potentials, and terms of these alone. The
-    drift must have no friction."""
+    """The terms of the drift without the slow potentials, and the terms of the slow
+    potentials. The drift must have no friction."""
     rest = []
     slow = []
     for term in drift:

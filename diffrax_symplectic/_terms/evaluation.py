@@ -26,10 +26,10 @@ NEED_VALUES = (
 def call_user_function(
     name: str, function: Callable, *inputs: PyTree, args: Args
 ) -> Any:
-    """Returns `function(*inputs, args)`, where `function` is the user's argument of this
-    name. Its errors while JAX traces it are raised with advice."""
-    # The function gets a copy: if it modifies `args` in place, each trace still has the
-    # same ones.
+    """Returns `function(*inputs, args)`, where `function` is the user's argument `name`.
+    Errors that it raises while JAX traces it are raised with advice."""
+    # The function gets a copy of the containers in `args`. If it modifies them in place,
+    # the next trace still gets the original `args`.
     copy = jtu.tree_map(lambda leaf: leaf, args)
     note_call(function, *inputs, copy)
     try:
@@ -44,7 +44,7 @@ def call_user_function(
         # Errors of Python and JAX about `None` name its type.
         if args is None and "NoneType" in str(error):
             error.add_note(f"`{name}` was called with `args=None`. Was it left out?")
-        # A function may compare words, but not compute with them.
+        # `args` may hold strings, with which a function can select, but not compute.
         kinds = {type(x).__name__ for x in jtu.tree_leaves(args) if not is_numeric(x)}
         if kinds:
             error.add_note(f"`args` hold no numbers, but {', '.join(sorted(kinds))}.")
@@ -52,8 +52,8 @@ def call_user_function(
 
 
 def checked_energy(name: str, H: Callable, *inputs: PyTree, args: Args) -> Array:
-    """The value of the user's Hamiltonian `H(*inputs, args)` of this name, as a float.
-    Raises a `ValueError` if it is not a real scalar."""
+    """The value of a Hamiltonian, `H(*inputs, args)`, as a float, where `H` is the user's
+    argument `name`. Raises a `ValueError` if the value is not a real scalar."""
     energy = call_user_function(name, H, *inputs, args=args)
     if not jtu.all_leaves([energy]) or jnp.shape(energy) != ():
         raise ValueError(
@@ -62,12 +62,13 @@ def checked_energy(name: str, H: Callable, *inputs: PyTree, args: Args) -> Array
             "`jax.vmap` the solve.)"
         )
     check_real_energies(name, energy)
-    # `jax.grad` refuses integers, such as the `0` of a particle without energy.
+    # `jax.grad` refuses integers, such as `0` for a system without energy.
     return jnp.asarray(energy, jnp.result_type(energy, float))
 
 
 def check_real_energies(name: str, energies: PyTree[Array]) -> None:
-    """Raises a `ValueError` unless the user's Hamiltonians of this name are real."""
+    """Raises a `ValueError` unless `energies`, the values of the user's argument `name`,
+    are real."""
     leaves = jtu.tree_leaves(energies)
     if not all(eqx.is_array_like(x) and not jnp.iscomplexobj(x) for x in leaves):
         raise ValueError(

@@ -94,11 +94,9 @@ def hamiltonian_terms(
     drift = with_constraint(drift, constraint)
     if noise is None and path is None:
         return diffrax.MultiTerm(drift)
-    # If only one of the two was left out, its own check says so.
-    noise = cast(Hamiltonian, noise)
-    return diffrax.MultiTerm(
-        drift, *noise_terms(noise, path, structure=structure).terms
-    )
+    # If only one of `noise` and `path` was left out, `noise_terms` raises an error.
+    diffusion = noise_terms(cast(Hamiltonian, noise), path, structure=structure)
+    return diffrax.MultiTerm(drift, *diffusion.terms)
 
 
 def noise_terms(
@@ -130,6 +128,7 @@ def noise_terms(
 
 
 def _check_structure_name(structure: Any) -> None:
+    """Raises a `ValueError` if the user's argument `structure` is not a known one."""
     known = get_args(AssertedStructure)
     if structure not in (None, *known):
         raise ValueError(

@@ -60,7 +60,7 @@ def ito_drift(*noise: diffrax.AbstractTerm) -> diffrax.ODETerm:
             f"`diffrax.ControlTerm(field, path)` or `noise_terms(H, path)`; got {names}."
         )
     motions = motion_numbers([path for (path,) in paths])
-    # A drift must not hold paths, which would make it noise; only their shapes are used.
+    # A term with a path would count as noise. The drift needs only the shapes of the paths.
     pathless = replace_paths(
         parts, lambda path: UnspecifiedPath(increment_struct(path))
     )
@@ -71,9 +71,9 @@ def ito_drift(*noise: diffrax.AbstractTerm) -> diffrax.ODETerm:
 class _ItoDrift(eqx.Module):
     """The vector field of `ito_drift`.
 
-    - `leaves`, `structure`: the noise terms, flattened. As terms they would be found by the
-        functions that look for noise and its Hamiltonians in a PyTree of terms.
-    - `motions`: the number of the Brownian motion that drives each of the terms.
+    - `leaves`, `structure`: the noise terms, flattened. Functions that look for noise or
+        Hamiltonians in a PyTree of terms would find whole noise terms within this drift.
+    - `motions`: for each noise term the number of the Brownian motion that drives it.
     """
 
     leaves: list[Any]
@@ -86,7 +86,8 @@ class _ItoDrift(eqx.Module):
         zeros, unravel = zeros_and_unravel(dict(zip(self.motions, structs)))
 
         def derivative_along_itself(unit: Float[Array, " n"]) -> Y:
-            """`b_k' b_k` for the noise `k` whose increment in `unit` is one."""
+            """`b_k' b_k`, for the noise `k` whose increment is one. `unit` holds the
+            increments of all Brownian motions, flattened; the others are zero."""
             increments = unravel(unit)
             controls = [increments[motion] for motion in self.motions]
             field = ft.partial(apply, noise, controls, args, t)

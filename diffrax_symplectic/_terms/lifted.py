@@ -1,5 +1,5 @@
 """Hamiltonians of another variable than `(p, q)`, such as spins or complex amplitudes, and
-the damping that keeps the lengths of these."""
+the damping of these. The variable is a function of `(p, q)`, here called its chart."""
 
 from collections.abc import Callable
 from typing import Any
@@ -18,15 +18,17 @@ from .symplectic_gradients import IndexedNoise
 
 
 class Lifted(AbstractCaller):
-    """A Hamiltonian in another variable, `H(t, chart(p, q), args)`.
+    """A Hamiltonian in another variable, `H(t, chart((p, q)), args)`, as a function of
+    `(p, q)`.
 
-    A Module and not a closure, so that parameters within `H` stay leaves of the terms, and
-    that `has_lifted` finds it.
+    It is a Module and not a closure, so that parameters within `H` stay leaves of the
+    terms, and so that `has_lifted` finds it.
     """
 
     H: Callable
     chart: Callable[[tuple[PyTree, PyTree]], PyTree]
-    # Whether it is the function of an `IndexedNoise`, which takes the index first.
+    # Whether `H` is the function of an `IndexedNoise`, which takes the index of a noise
+    # before the time.
     is_indexed: bool = eqx.field(static=True, default=False)
 
     def called_with(self, t, y, args):
@@ -35,7 +37,8 @@ class Lifted(AbstractCaller):
         return {"H": (index, *inputs) if self.is_indexed else inputs}
 
     def __call__(self, *inputs) -> PyTree[Array]:
-        # The first inputs are the time, or from an `IndexedNoise` the index and the time.
+        # The inputs before `p` are the time, or for an `IndexedNoise` the index and the
+        # time.
         *index_and_time, p, q, args = inputs
         return self.H(*index_and_time, self.chart((p, q)), args)
 
@@ -53,8 +56,9 @@ def lifted_terms(
     variable_name: str,
     damped_drift: Callable | None,
 ) -> diffrax.MultiTerm:
-    """The terms of Hamiltonians in the variable `chart((p, q))`, which messages call
-    `variable_name`. The vector field `damped_drift` takes the place of that of `H0`."""
+    """The terms of Hamiltonians in the variable `chart((p, q))`. Messages call the variable
+    `variable_name`. If there is a vector field `damped_drift`, it takes the place of the
+    vector field of `H0`."""
     check_takes("H0", H0, "t", variable_name, "args")
     if noise is None:
         if path is not None:
@@ -64,8 +68,8 @@ def lifted_terms(
             )
         lifted_noise = None
     elif isinstance(noise, IndexedNoise):
-        # The noise can still be evaluated one at a time, for the solvers that follow the
-        # flow of one noise after another.
+        # The lifted noises can also be evaluated one at a time, for the solvers that follow
+        # the flow of one noise after another.
         lifted_noise = IndexedNoise(Lifted(noise.H, chart, is_indexed=True), noise.m)
     else:
         check_takes("noise", noise, "t", variable_name, "args")
@@ -77,9 +81,9 @@ def lifted_terms(
 
 
 def checked_damping(each: str, alpha: ArrayLike) -> ArrayLike:
-    """The damping `alpha` in an array: a number, or one for each vector that is damped,
-    such as "each spin" for `each`. Raises a `ValueError` if it is known to be negative or
-    not finite."""
+    """The damping `alpha`, a number or an array of numbers, one for each damped vector.
+    Raises a `ValueError` if a number is known to be negative or not finite. Its message
+    calls a vector `each`, such as "each spin"."""
     return checked_not_negative(
         "damping", alpha, expected=f"a number, or an array with one for {each}"
     )
@@ -88,9 +92,9 @@ def checked_damping(each: str, alpha: ArrayLike) -> ArrayLike:
 def damping_for(
     each: str, alpha: ArrayLike, shape: tuple[int, ...], dtype: Any
 ) -> Array:
-    """The damping `alpha` of vectors in an array of this shape, without the axis of their
-    components; NaN where it is negative or not finite. Raises a `ValueError` unless it is a
-    number or has this shape."""
+    """The damping `alpha` of vectors in an array of shape `(*shape, components)`; NaN where
+    it is negative or not finite. Raises a `ValueError` unless `alpha` is a number or has
+    the shape `shape`. Its message calls a vector `each`."""
     alpha = jnp.asarray(alpha, dtype)
     if alpha.shape not in ((), shape):
         raise ValueError(

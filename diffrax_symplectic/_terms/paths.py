@@ -1,5 +1,10 @@
-"""The Brownian paths that terms hold: which ones, with which keys, and others in their
-place. Which path a solver needs is said by the solver."""
+"""The Brownian paths that terms hold: finding them, comparing them, and replacing them or
+their random keys.
+
+In place of a path, terms may hold only its shape, as an `UnspecifiedPath`, until it is
+known which path the solver needs. A path that stands in several terms is one Brownian
+motion: paths are numbered by the motion that they sample, see `motion_numbers`.
+"""
 
 import itertools
 import operator
@@ -26,13 +31,15 @@ from .._compat import at_trace_time, is_traced, not_a_path
 from .._parts import parts_of, with_parts
 
 
-# The first seed of paths made from shapes beside paths of the user's, whose keys come from
-# small seeds as a rule: equal keys would give both the same noise.
+# The first seed of paths that are made from shapes, if the terms also hold paths of the
+# user's. Users make keys from small seeds as a rule, and two paths with equal keys would
+# have the same noise.
 _SEED_BESIDE_OTHERS = 0x5EED0000
 
 
 def as_path(path: Any) -> diffrax.AbstractBrownianPath:
-    """`path`, or an `UnspecifiedPath` for a shape. Otherwise raises a `ValueError`."""
+    """`path` itself, or an `UnspecifiedPath` if it is a shape. Raises a `ValueError` if it
+    is neither."""
     if isinstance(path, diffrax.AbstractBrownianPath):
         return path
     is_tuple = isinstance(path, tuple) and all(isinstance(n, int) for n in path)
@@ -54,8 +61,8 @@ def as_path(path: Any) -> diffrax.AbstractBrownianPath:
 
 
 def shapes_as_paths(terms: PyTree) -> PyTree:
-    """The terms with an `UnspecifiedPath` in each `ControlTerm` that has a shape in place
-    of its path."""
+    """The terms with an `UnspecifiedPath` in each `ControlTerm` that the user gave a shape
+    in place of a path."""
 
     def with_path(term: Any) -> Any:
         shape = not_a_path(term)
@@ -69,33 +76,34 @@ def shapes_as_paths(terms: PyTree) -> PyTree:
 def which_are_shapes(terms: PyTree) -> list[bool]:
     """For each Brownian path of the terms, in order, whether the terms hold its shape
     instead of the path."""
-    return [
-        isinstance(x, UnspecifiedPath) for x in brownian_paths(shapes_as_paths(terms))
-    ]
+    paths = brownian_paths(shapes_as_paths(terms))
+    return [isinstance(path, UnspecifiedPath) for path in paths]
 
 
 def brownian_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
-    """All Brownian paths of the terms, one for each place."""
+    """The Brownian paths of the terms, in order. A path that several terms hold is listed
+    for each of them."""
     return parts_of(diffrax.AbstractBrownianPath, terms)
 
 
 def random_paths(terms: PyTree) -> list[diffrax.AbstractBrownianPath]:
-    """The Brownian paths of the terms that draw their noise from a random key, and the
-    shapes of paths."""
+    """Those Brownian paths of the terms that draw their noise from a random key. The shapes
+    of paths count as such paths."""
     return [path for path in brownian_paths(terms) if is_random(path)]
 
 
 def has_unknown_law(path: diffrax.AbstractBrownianPath) -> bool:
-    """Whether the law of this path is not known here, as for the user's own classes, which
-    need not be Brownian motions."""
+    """Whether the law of the increments of a path is not known. This is so for the user's
+    own classes, which need not be Brownian motions."""
     return laws_of(path) is None and not isinstance(path, UnspecifiedPath)
 
 
 def motion_numbers(paths: Sequence[diffrax.AbstractBrownianPath]) -> tuple[int, ...]:
-    """The number of the Brownian motion that each path samples, counted from 0. Equal paths
-    sample the same one; two shapes of paths never do."""
+    """For each path the number of the Brownian motion that it samples, counted from 0.
+    Equal paths sample the same motion. Each shape of a path is a motion of its own."""
     numbers: list[int] = []
     for path in paths:
+        # `zip` ends with `numbers`, so it pairs only the earlier paths with their numbers.
         matches = (n for n, other in zip(numbers, paths) if _are_equal(path, other))
         numbers.append(next(matches, max(numbers, default=-1) + 1))
     return tuple(numbers)
@@ -104,8 +112,8 @@ def motion_numbers(paths: Sequence[diffrax.AbstractBrownianPath]) -> tuple[int, 
 def _are_equal(
     path: diffrax.AbstractBrownianPath, other: diffrax.AbstractBrownianPath
 ) -> bool:
-    """Whether two paths are the same. The values of traced paths are not known: these are
-    the same if they hold the same arrays."""
+    """Whether two paths sample the same Brownian motion. Shapes of paths never do. Traced
+    paths, whose values are not known, do if they hold the same array objects."""
     if isinstance(path, UnspecifiedPath):
         return False
     with at_trace_time():
@@ -122,7 +130,7 @@ def replace_paths(terms: PyTree, new_path: Callable) -> PyTree:
 
 def with_paths_for_shapes(terms: PyTree, make_path: Callable) -> PyTree:
     """The terms with `make_path(shape, key)` in place of each shape of a path. The keys
-    differ: each shape is a Brownian motion of its own."""
+    differ, since each shape is a Brownian motion of its own."""
     terms = shapes_as_paths(terms)
     has_only_shapes = all(which_are_shapes(terms))
     seeds = itertools.count(0 if has_only_shapes else _SEED_BESIDE_OTHERS)
@@ -138,17 +146,19 @@ def with_paths_for_shapes(terms: PyTree, make_path: Callable) -> PyTree:
 def with_paths(
     make_path: Callable, numbers: tuple[int, ...], terms: PyTree, key: PRNGKeyArray
 ) -> PyTree:
-    """The terms with `make_path(shape, key)` in place of each random path. `numbers` are
-    the `motion_numbers` of the random paths: those with the same number get the same key.
-    Paths of the user's own classes only get other keys."""
+    """The terms with `make_path(shape, key)` in place of each random path, or with a new
+    key in the path if its law is unknown.
+
+    `numbers` are the `motion_numbers` of the random paths. Paths with the same number get
+    the same key, derived from `key`."""
     remaining_numbers = iter(numbers)
 
     def new_path(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
         if not is_random(path):
             return path
         number = next(remaining_numbers)
-        # With one Brownian motion, which is the usual case, the user's key is its key: the
-        # same path can then be made by hand.
+        # The first Brownian motion gets the user's key itself, so that in the usual case of
+        # a single motion the same path can be made by hand.
         path_key = key if number == 0 else jr.fold_in(key, number + 1)
         if not has_unknown_law(path):
             return make_path(increment_struct(path), path_key)
@@ -162,14 +172,14 @@ def with_paths(
 
 
 def path_keys(terms: PyTree[diffrax.AbstractTerm], key: PRNGKeyArray) -> list[Array]:
-    """New random keys for the paths in `terms`, derived from `key`. Paths that share a key
-    get the same new one."""
+    """New random keys, derived from `key`, one for each key in the paths of `terms`, in
+    order. Equal keys get equal new keys."""
     old_keys = filter(is_key, jtu.tree_leaves(brownian_paths(terms)))
     return [derived_key(key, old_key) for old_key in old_keys]
 
 
 def with_keys(terms: PyTree[diffrax.AbstractTerm], keys: list[Array]) -> PyTree:
-    """The terms with these keys, from `path_keys`, in their paths."""
+    """The terms with the `keys`, from `path_keys(terms, key)`, in their paths."""
     remaining_keys = iter(keys)
 
     def with_next_keys(path: diffrax.AbstractBrownianPath) -> PyTree:

@@ -82,6 +82,7 @@ def spin_terms(
     return lifted_terms(H0, noise, path, from_spinors, "s", damped_drift)
 
 
+# What messages about the damping call one vector.
 _EACH = "each spin"
 
 
@@ -103,15 +104,15 @@ class _DampedPrecession(AbstractCaller):
 
         gradient = jax.grad(energy)(s)
         alpha = damping_for(_EACH, self.alpha, s.shape[:-1], s.dtype)
-        # Without damping `omega` is the gradient. The cross product that damping adds lets
-        # the spin spiral to lower energy.
+        # `omega`. Without damping it is the gradient. Damping adds a cross product, which
+        # lets the spin spiral to lower energy.
         s1, s2, s3 = _components(s)
         g1, g2, g3 = _components(gradient)
         w1 = g1 + alpha * (s2 * g3 - s3 * g2)
         w2 = g2 + alpha * (s3 * g1 - s1 * g3)
         w3 = g3 + alpha * (s1 * g2 - s2 * g1)
-        # `symplectic_gradient` of `omega . s(p, q)`, with `omega` fixed, by hand: it takes
-        # 1.3 times as long by `jax.grad`.
+        # The symplectic gradient of `omega . s(p, q)`, with `omega` fixed, by hand: by
+        # `jax.grad` it takes 1.3 times as long.
         p, q = y
         p1, p2 = _components(p)
         q1, q2 = _components(q)
@@ -123,7 +124,7 @@ class _DampedPrecession(AbstractCaller):
 
 
 def _components(x: Float[Array, "*spins d"]) -> Sequence[Float[Array, " *spins"]]:
-    """The components along the last axis, to be assigned to names."""
+    """The components along the last axis, each as an array."""
     return jnp.moveaxis(jnp.asarray(x), -1, 0)  # pyright: ignore
 
 
@@ -195,8 +196,8 @@ def to_spinors(s: _Spins) -> _Spinors:
     s1, s2, s3 = _components(s / scale)
     is_north = s3 >= 0
     length = jnp.sqrt(s1**2 + s2**2 + s3**2)
-    # Of `a` and `b` the larger one is chosen real. The other one follows by a division by
-    # it, which is accurate near both poles.
+    # The larger one of `a` and `b` is chosen real and positive. The other one follows by a
+    # division by the larger one, which is accurate near both poles.
     larger = jnp.sqrt(2 * (length + jnp.where(is_north, s3, -s3)))
     other_q = 2 * s1 / larger
     other_p = 2 * s2 / larger

@@ -1,5 +1,9 @@
-"""Vector fields from Hamiltonians, by `jax.grad`: of a drift, also with friction, and of
-the noise. And what terms tell of the Hamiltonians that they come from."""
+"""Vector fields from Hamiltonians, by `jax.grad`.
+
+- `Drift`: the vector field of the energy, also with friction.
+- `HamiltonianNoise`: the noise.
+- `hamiltonian_parts` and what follows it: the Hamiltonians within given terms.
+"""
 
 import abc
 import functools as ft
@@ -87,10 +91,10 @@ class IndexedNoise(AbstractCaller):
 
 
 class OneNoise(eqx.Module):
-    """A control with a single nonzero noise.
+    """A control that is zero for all noises but one.
 
-    - `index`: that of the noise in the flattened path.
-    - `increment`: its value.
+    - `index`: the index of this noise in the flattened control.
+    - `increment`: the increment of this noise.
     """
 
     index: IntScalarLike
@@ -98,7 +102,7 @@ class OneNoise(eqx.Module):
 
 
 class AbstractFriction(AbstractCaller):
-    """A vector field `(-G v, 0)` with the velocities `v`."""
+    """The vector field `(-G v, 0)` of a friction `G`, with the velocities `v`."""
 
     @abc.abstractmethod
     def velocity(self, t: RealScalarLike, y: _State, args: Args) -> HalfState:
@@ -119,15 +123,16 @@ class AbstractFriction(AbstractCaller):
 
 
 class Drift(AbstractCaller):
-    """The vector field `(-dH/dq, dH/dp)` of the energy `H`, which is `H0`, the potential
-    `slow`, or the sum of both; and friction on its velocities `dH/dp`, if there is any.
+    """The vector field `(-dH/dq, dH/dp)` of an energy `H`, with friction on the velocities
+    `dH/dp` if there is any.
 
-    Friction is in the same term, since the solvers of Diffrax for stochastic equations take
-    one drift and one noise."""
+    The energy is `H0`, the potential `slow`, or the sum of both. Friction is in the same
+    term, since the solvers of Diffrax for stochastic equations take one drift and one
+    noise."""
 
     H0: Hamiltonian | None
     structure: AssertedStructure | None = eqx.field(static=True, default=None)
-    # The user's function call that took `structure`, for messages.
+    # The name of the function that the user passed `structure` to, for messages.
     made_by: str = eqx.field(static=True, default="hamiltonian_terms")
     slow: Callable | None = None
     friction: AbstractFriction | None = None
@@ -155,8 +160,11 @@ class Drift(AbstractCaller):
 
 
 class AbstractNoise(diffrax.AbstractTerm, AbstractCaller):
-    """Noise with a Brownian path. Subclasses define `vf_prod`, which costs less than `vf`:
-    this has a trailing axis of noises for each array of the state."""
+    """Noise with a Brownian path.
+
+    Subclasses define `vf_prod`. Solvers that call `vf` and `prod` instead pay for the
+    vector fields of all noises, which have a trailing axis of noises for each array of the
+    state."""
 
     path: AbstractVar[diffrax.AbstractBrownianPath]
 
@@ -164,7 +172,7 @@ class AbstractNoise(diffrax.AbstractTerm, AbstractCaller):
         return self.path.evaluate(t0, t1, **kwargs)
 
     def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
-        # Diffrax's own solvers ask for this if they take several stages with one field.
+        # Diffrax's own solvers call this if they use one vector field for several controls.
         zeros, unravel = zeros_and_unravel(increment_struct(self.path))
 
         def product(unit: Array) -> _State:
@@ -180,8 +188,8 @@ class AbstractNoise(diffrax.AbstractTerm, AbstractCaller):
 
 
 class HamiltonianNoise(AbstractNoise):
-    """The noise of Hamiltonians. Its product with the control `I` is the symplectic
-    gradient of `I . H`."""
+    """The noise of Hamiltonians `H`, an array or a PyTree. The vector field times the
+    control `I` is the symplectic gradient of `I . H`."""
 
     noise: Hamiltonian
     path: diffrax.AbstractBrownianPath
@@ -195,32 +203,12 @@ class HamiltonianNoise(AbstractNoise):
         self, t: RealScalarLike, y: _State, args: Args, control: BM | OneNoise
     ) -> _State:
         check_pair(y)
-        struct = increment_struct(self.path)
-
-        def fits(H: Array, struct: jax.ShapeDtypeStruct) -> bool:
-            # The shapes of a single noise may differ: its Hamiltonian may be a scalar and
-            # its increment an array of one number, or the other way round.
-            return jnp.shape(H) == struct.shape or jnp.size(H) == struct.size == 1
 
         def hamiltonians(p: HalfState, q: HalfState) -> PyTree[Array]:
-            """The noise Hamiltonians, in the structure and shapes of the path."""
-            if isinstance(self.noise, IndexedNoise):
-                # An `IndexedNoise` gives advice on the errors of its function by itself.
-                H = self.noise(t, p, q, args)
-            else:
-                H = call_user_function("noise", self.noise, t, p, q, args=args)
-            same_structure = jtu.tree_structure(H) == jtu.tree_structure(struct)
-            if not same_structure or not jtu.tree_all(jtu.tree_map(fits, H, struct)):
-                raise ValueError(
-                    "`noise` must return one Hamiltonian for each noise of the path, which "
-                    f"has shape {shapes(struct)}; got shape {shapes(H)}. Return an "
-                    "array of the shape of the path, or make a path of the other shape."
-                )
-            check_real_energies("noise", H)
-            return jtu.tree_map(lambda leaf, s: jnp.reshape(leaf, s.shape), H, struct)
+            return self._hamiltonians(t, p, q, args)
 
-        # The gradient of such Hamiltonians is zero, so noise would be missing without an
-        # error. This traces them once more in every call, but at run time costs nothing.
+        # The gradient would be zero, so the noise would be missing without an error. This
+        # check traces the Hamiltonians once more, and costs nothing at run time.
         if Dependence(hamiltonians, *y).independent(of=lambda p, q: (p, q)):
             raise ValueError(
                 "`noise` does not depend on the state, so there is no noise. Return "
@@ -232,7 +220,8 @@ class HamiltonianNoise(AbstractNoise):
         def dot(H: Array, increment: Array) -> Array:
             return jnp.sum(H * increment.astype(H.dtype))
 
-        # The noise of a step is the gradient of one scalar, for any number of noises.
+        # `I . H`. The noise of a step is the gradient of this one scalar, for any number of
+        # noises.
         def energy(p: HalfState, q: HalfState) -> Any:
             if not isinstance(control, OneNoise):
                 dots = jtu.tree_map(dot, hamiltonians(p, q), control)
@@ -245,6 +234,31 @@ class HamiltonianNoise(AbstractNoise):
             return H * jnp.asarray(control.increment, H.dtype)
 
         return symplectic_gradient(energy, y)
+
+    def _hamiltonians(self, t, p: HalfState, q: HalfState, args: Args) -> PyTree[Array]:
+        """The noise Hamiltonians, in the structure and shapes of the path. Raises a
+        `ValueError` if they do not fit the path, or are not real."""
+        if isinstance(self.noise, IndexedNoise):
+            # An `IndexedNoise` itself gives advice on the errors of its function.
+            H = self.noise(t, p, q, args)
+        else:
+            H = call_user_function("noise", self.noise, t, p, q, args=args)
+        structs = increment_struct(self.path)
+
+        def fits(H: Array, struct: jax.ShapeDtypeStruct) -> bool:
+            # The shapes of a single noise may differ: its Hamiltonian may be a scalar and
+            # its increment an array of one number, or the other way round.
+            return jnp.shape(H) == struct.shape or jnp.size(H) == struct.size == 1
+
+        same_structure = jtu.tree_structure(H) == jtu.tree_structure(structs)
+        if not same_structure or not jtu.tree_all(jtu.tree_map(fits, H, structs)):
+            raise ValueError(
+                "`noise` must return one Hamiltonian for each noise of the path, which "
+                f"has shape {shapes(structs)}; got shape {shapes(H)}. Return an "
+                "array of the shape of the path, or make a path of the other shape."
+            )
+        check_real_energies("noise", H)
+        return jtu.tree_map(lambda leaf, s: jnp.reshape(leaf, s.shape), H, structs)
 
     def is_vf_expensive(self, t0, t1, y, args) -> bool:
         # `vf` takes one reverse pass per noise, `vf_prod` a single one.
@@ -261,8 +275,8 @@ def symplectic_gradient(energy: Callable, y: _State) -> _State:
 def hamiltonian_parts(
     terms: PyTree[diffrax.AbstractTerm],
 ) -> list[Drift | HamiltonianNoise]:
-    """The vector fields and noises in terms that come from Hamiltonians. The terms may be
-    wrapped or have friction."""
+    """The parts of terms that come from Hamiltonians: vector fields of drifts, and noises.
+    The terms may be wrapped or have friction."""
     return parts_of((Drift, HamiltonianNoise), terms)
 
 
@@ -272,12 +286,13 @@ def is_hamiltonian(term: diffrax.AbstractTerm) -> bool:
 
 
 def asserted_structure(term: diffrax.AbstractTerm) -> str | None:
-    """The `structure` that the user asserted for a term, and for all parts of it."""
+    """The `structure` that the user asserted for a term; `None` unless it is the same for
+    all parts of the term that come from Hamiltonians."""
     asserted = {part.structure for part in hamiltonian_parts(term)}
     return asserted.pop() if len(asserted) == 1 else None
 
 
 def name_of_maker(term: diffrax.AbstractTerm) -> str | None:
-    """The name of the function of this package that made a term from Hamiltonians and takes
-    their `structure`, such as `"langevin_terms"`; `None` for other terms."""
+    """The name of the function of this package that made a term from Hamiltonians, such as
+    `"langevin_terms"`; `None` for other terms. The function takes `structure`."""
     return next((part.made_by for part in hamiltonian_parts(term)), None)

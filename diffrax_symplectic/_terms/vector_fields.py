@@ -23,7 +23,7 @@ from .symplectic_gradients import HamiltonianNoise, OneNoise
 @eqx.filter_jit
 def apply(terms: Terms, controls: list, args: Args, t: RealScalarLike, y: Y) -> Y:
     """The change of the state: the sum over terms of vector field times control. Raises a
-    `ValueError` if it does not have the dtypes and shapes of the state."""
+    `ValueError` if the change does not have the dtypes and shapes of the state."""
     pairs = zip(terms, controls)
     changes = [term.vf_prod(t, y, args, control) for term, control in pairs]
     return _checked_sum(changes, y)
@@ -38,52 +38,57 @@ def apply_one(
     t: RealScalarLike,
     y: Y,
 ) -> Y:
-    """The vector field of one noise times its increment. `index` is that of the noise among
-    the noises of all terms, in the order of their flattened controls."""
+    """The vector field of one noise times its increment.
 
-    def product(
-        term: diffrax.AbstractTerm, struct: PyTree, k: IntScalarLike, w: Array
-    ) -> Y:
-        """The vector field of noise `k` of this term times its increment `w`. Where
-        possible no other noise is evaluated or multiplied."""
-        # Only the kind is read from the user's term. The term itself is called, which keeps
-        # the direction of time that Diffrax wraps around it.
-        if isinstance(unwrapped(term), HamiltonianNoise):
-            return term.vf_prod(t, y, args, OneNoise(k, w))
-        if isinstance(unwrapped(term), diffrax.ControlTerm):
-            field = term.vf(t, y, args)
-            # Only an array, for noises in one array, can be indexed by the noise: no
-            # operator of Lineax and no other PyTree.
-            are_arrays = eqx.is_array(field) and isinstance(
-                struct, jax.ShapeDtypeStruct
-            )
-            # A scalar noise has no axis of noises to index.
-            if are_arrays and field.ndim > 0 and field.shape[-1:] == struct.shape:
-                return field[..., k] * w.astype(field.dtype)
-        # Everything else adds up all noises, so all increments but this one are zero.
-        zeros, unravel = zeros_and_unravel(struct)
-        increments = zeros.at[k].set(w.astype(zeros.dtype))
-        return term.vf_prod(t, y, args, unravel(increments))
-
+    `index` counts the noises of all terms, in the order of their flattened controls. It may
+    be traced, so every term is evaluated; those without this noise add zero."""
     changes = []
     # The number of noises of the terms before this one.
     num_before = 0
     for term in terms:
-        struct = control_struct(term)
-        num_in_term = num_noises(struct)
-        # If the noise belongs to another term, this one adds zero.
+        num_in_term = num_noises(control_struct(term))
         is_in_term = (num_before <= index) & (index < num_before + num_in_term)
         index_in_term = jnp.clip(index - num_before, 0, num_in_term - 1)
         increment_or_zero = jnp.where(is_in_term, increment, 0)
-        changes.append(product(term, struct, index_in_term, increment_or_zero))
+        changes.append(_one_product(term, index_in_term, increment_or_zero, args, t, y))
         num_before += num_in_term
     return _checked_sum(changes, y)
+
+
+def _one_product(
+    term: diffrax.AbstractTerm,
+    k: IntScalarLike,
+    w: Array,
+    args: Args,
+    t: RealScalarLike,
+    y: Y,
+) -> Y:
+    """The vector field of noise `k` of a term times the increment `w` of this noise. Where
+    possible, no other noise is evaluated or multiplied."""
+    # `unwrapped(term)` tells the class of the user's term. What is called is `term` itself:
+    # Diffrax may have wrapped it to run backward in time.
+    if isinstance(unwrapped(term), HamiltonianNoise):
+        return term.vf_prod(t, y, args, OneNoise(index=k, increment=w))
+    control = control_struct(term)
+    if isinstance(unwrapped(term), diffrax.ControlTerm):
+        field = term.vf(t, y, args)
+        # The field of noise `k` is `field[..., k]` if the increments are an array of shape
+        # `(m,)` and the field is an array of shape `(..., m)`. A scalar noise has no such
+        # axis, and a PyTree or an operator of Lineax cannot be indexed.
+        are_arrays = isinstance(control, jax.ShapeDtypeStruct) and eqx.is_array(field)
+        if are_arrays and field.ndim > 0 and field.shape[-1:] == control.shape:
+            return field[..., k] * w.astype(field.dtype)
+    # All other terms only give the sum over their noises, so the other increments are zero.
+    zeros, unravel = zeros_and_unravel(control)
+    increments = zeros.at[k].set(w.astype(zeros.dtype))
+    return term.vf_prod(t, y, args, unravel(increments))
 
 
 def rate(drift: Terms, t: RealScalarLike, y: Y, args: Args) -> Y:
     """The rate of change of the state by the drift."""
     t = jnp.asarray(t, jnp.result_type(t, jnp.float32))
-    # The step has size one. Its place does not matter, since the drift is driven by time.
+    # The control of a drift is the length of a step. With length one, the change of the
+    # state is its rate.
     start = jnp.zeros_like(t)
     end = jnp.ones_like(t)
     controls = [term.contr(start, end) for term in drift]
@@ -91,8 +96,8 @@ def rate(drift: Terms, t: RealScalarLike, y: Y, args: Args) -> Y:
 
 
 def check_terms_fit_state(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) -> None:
-    """Raises a `ValueError` unless these are terms that fit the state `y0`. (A PyTree of
-    terms, as some Diffrax solvers take, is not checked further.)"""
+    """Raises a `ValueError` unless `terms` are Diffrax terms that fit the state `y0`. (A
+    PyTree of terms, as some solvers of Diffrax take, need not fit.)"""
     if not parts_of(diffrax.AbstractTerm, terms):
         raise ValueError(
             "`terms` must be Diffrax terms, such as `hamiltonian_terms(H0, noise, path)`"
@@ -101,7 +106,8 @@ def check_terms_fit_state(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) 
     if not isinstance(terms, diffrax.AbstractTerm):
         return
     parts = tuple(flattened(without_constraint(terms)))
-    # This check comes first, since its message names the term and its path.
+    # `apply` below would raise for these mistakes, too. This check comes first, since its
+    # message names the term and its path.
     check_increments(parts, t0, y0, args)
 
     def total_change(t: RealScalarLike) -> Y:
@@ -114,7 +120,7 @@ def check_terms_fit_state(terms: PyTree, t0: RealScalarLike, y0: Y, args: Args) 
 
 def check_increments(terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> None:
     """Raises a `ValueError` if a `ControlTerm` cannot multiply its vector field by the
-    increments of its path. (The errors of JAX and Lineax name neither.)"""
+    increments of its path. (The errors of JAX and Lineax name neither of the two.)"""
 
     def product(term: diffrax.AbstractTerm) -> Y:
         field = term.vf(t0, y0, args)
@@ -122,34 +128,37 @@ def check_increments(terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> Non
         try:
             return term.prod(field, increments)
         except (TypeError, ValueError) as error:
-            fitting_path = (
-                "Construct the path with the shape and dtype that the field takes"
-            )
-            if isinstance(field, lx.AbstractLinearOperator):
-                description = f"a Lineax operator on {_brief(field.in_structure())}"
-                advice = fitting_path
-            elif len(jtu.tree_leaves(y0)) > 1:
-                description = f"arrays {_brief(field)}"
-                advice = (
-                    "Of a state of several arrays the vector field must be a Lineax "
-                    "operator, such as a `lineax.FunctionLinearOperator` that maps the "
-                    "increments to a change of the state"
-                )
-            else:
-                description = f"an array {_brief(field)}"
-                advice = f"{fitting_path}, for an array the shape of its last axes"
-            raise ValueError(
-                f"A `ControlTerm` cannot multiply its vector field, {description}, by the "
-                f"increments of its path, {_brief(increments)}. {advice}."
-            ) from error
+            raise ValueError(_misfit(field, increments, y0)) from error
 
-    # Tracing is enough: `product` raises.
     for term in terms:
         if isinstance(unwrapped(term), diffrax.ControlTerm):
+            # Tracing is enough: `product` raises.
             eqx.filter_eval_shape(product, term)
 
 
-def _brief(tree: PyTree) -> str:
+def _misfit(field: PyTree, increments: PyTree[Array], y0: Y) -> str:
+    """The message for a vector field that does not fit the increments of its path."""
+    fitting_path = "Construct the path with the shape and dtype that the field takes"
+    if isinstance(field, lx.AbstractLinearOperator):
+        description = f"a Lineax operator on {_shapes_and_dtypes(field.in_structure())}"
+        advice = fitting_path
+    elif len(jtu.tree_leaves(y0)) > 1:
+        description = f"arrays {_shapes_and_dtypes(field)}"
+        advice = (
+            "Of a state of several arrays the vector field must be a Lineax operator, such "
+            "as a `lineax.FunctionLinearOperator` that maps the increments to a change of "
+            "the state"
+        )
+    else:
+        description = f"an array {_shapes_and_dtypes(field)}"
+        advice = f"{fitting_path}, for an array the shape of its last axes"
+    return (
+        f"A `ControlTerm` cannot multiply its vector field, {description}, by the "
+        f"increments of its path, {_shapes_and_dtypes(increments)}. {advice}."
+    )
+
+
+def _shapes_and_dtypes(tree: PyTree) -> str:
     """The shapes and dtypes of arrays, for messages."""
     return eqx.tree_pformat(tree, struct_as_array=True)
 
@@ -163,12 +172,12 @@ def tree_sum(values: list[Y]) -> Y:
 
 
 def _checked_sum(changes: list[Y], y: Y) -> Y:
-    """The sum of changes of the state `y`, at least one. Raises a `ValueError` unless each
-    has the dtypes and shapes of the state; JAX raises its own for another structure."""
+    """The sum of at least one change of the state `y`. Raises a `ValueError` unless each
+    change has the dtypes and shapes of the state. For another structure JAX raises one."""
 
     def check(change: Any, x: Any) -> None:
-        # Either may be a number of Python or NumPy. Of a weakly typed array
-        # `jnp.result_type` is the default dtype, not its own.
+        # Both may be numbers of Python, which have no dtype. (`jnp.result_type` would not
+        # do: for a weakly typed array it is the default dtype, not that of the array.)
         change = jnp.asarray(change)
         x = jnp.asarray(x)
         if (change.dtype, change.shape) != (x.dtype, x.shape):

@@ -98,6 +98,7 @@ def wave_terms(
     return lifted_terms(H0, noise, path, from_pair, "psi", damped_drift)
 
 
+# What messages about the damping call one vector.
 _EACH = "each vector of amplitudes"
 
 
@@ -128,9 +129,9 @@ class _DampedWaves(AbstractCaller):
         by_p, by_q = jax.grad(energy, argnums=(0, 1))(p, q)
         vectors = jnp.shape(q)[:-1]
         alpha = damping_for(_EACH, self.alpha, vectors, jnp.result_type(q))
-        # The state is real: g = (by_q + i by_p) / sqrt(2) and psi = (q + i p) / sqrt(2). So
-        # `real` and `imaginary` are the parts of 2 g^+ psi, and `squares` is 2 psi^+ psi;
-        # half of alpha makes up for the 2.
+        # In terms of the real state, g = (by_q + i by_p) / sqrt(2) and
+        # psi = (q + i p) / sqrt(2). `real` and `imaginary` are the parts of 2 g^+ psi, and
+        # `squares` is 2 psi^+ psi. Half of alpha makes up for the factor 2.
         half_alpha = alpha[..., None] / 2
         real = _dot(by_q, q) + _dot(by_p, p)
         imaginary = _dot(by_q, p) - _dot(by_p, q)
@@ -178,5 +179,4 @@ def from_pair(y: _Pair) -> _Waves:
     **Raises:** a `ValueError` if `y` is not a pair of real arrays.
     """
     check_pair(y)
-    p, q = y
-    return jtu.tree_map(lambda p, q: (q + 1j * p) / math.sqrt(2), p, q)
+    return jtu.tree_map(lambda p, q: (q + 1j * p) / math.sqrt(2), *y)

@@ -1,4 +1,5 @@
-"""Positions that a constraint holds. Terms carry it in `constrained_drift`.
+"""Positions and momenta that satisfy a constraint. Terms hold their constraint in a
+`ConstrainedDrift`, of the module `constrained_drift`.
 
 - `surface`: the allowed positions and their tangent momenta: projections, free flight.
 - `multipliers`: the multipliers of a free flight, by Newton's method.

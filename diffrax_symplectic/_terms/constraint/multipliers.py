@@ -1,5 +1,5 @@
-"""The multipliers of a constraint, by Newton's method, and the sums over vectors that they
-and the constraints need."""
+"""The multipliers of a constraint, by Newton's method; and sums of vectors, for short
+vectors in a form that XLA compiles well."""
 
 import functools as ft
 import operator
@@ -28,11 +28,11 @@ class _Newton(NamedTuple):
     """The state of Newton's method.
 
     - `x`: the multipliers.
-    - `residual`: the constraints before their last correction.
-    - `correction`: the last correction.
-    - `remaining`: how many corrections may follow; `_SOLVED` after the last one, and 0 if
-        the method failed. (With an array for each of the three, steps of 1,000 rigid dimers
-        took 1.2 times as long.)
+    - `residual`: the values of the constraints before the last correction.
+    - `correction`: the last correction, which was subtracted from the multipliers.
+    - `remaining`: how many corrections may follow; `_SOLVED` if the method has converged,
+        and 0 if it failed. (With three arrays in place of this one, a count and two flags,
+        steps of 1,000 rigid dimers took 1.2 times as long.)
     """
 
     x: Multipliers
@@ -51,20 +51,25 @@ def find_multipliers(
     start: Multipliers,
     pending: Bool[Array, ""],
 ) -> tuple[Multipliers, Bool[Array, ""]]:
-    """The root of `residual`, from `start`, and whether it was found; otherwise zero.
+    """The multipliers, a root of `residual`, and whether they were found. If not, they are
+    zero.
 
-    - `residual`: the constraints as a function of the multipliers.
-    - `gram`: about the size of its derivative.
+    - `residual`: the values of the constraints as a function of the multipliers.
+    - `gram`: a matrix of about the size of the derivative of `residual`.
     - `rounding`: the change of the constraints by rounding errors of the positions.
+    - `start`: the multipliers to start from.
     - `pending`: if false, no step is taken and nothing is found, so that in a batch a path
         that failed before does not keep the others waiting.
 
-    The method ends when the next correction would be below rounding errors, by the change
-    of the derivative in the last one. Corrections themselves may never get as small as the
-    rounding errors of the positions: near the origin `(q - 1)**2 - 1` is a difference of
-    numbers larger than `q`. How large is not known, neither from the positions nor from the
-    constraint, which is zero.
+    The method ends when the next correction would be below rounding errors. Its size is
+    estimated from the change of the derivative along the last one.
+
+    It would not do to wait for a correction below the rounding errors of the positions. It
+    may never be so small: near the origin `(q - 1)**2 - 1` is a difference of numbers that
+    are larger than `q`, and so are its rounding errors. How large these numbers are is not
+    known from the positions, nor from the constraint, which is zero.
     """
+    # About the change of each constraint by each multiplier.
     slopes = jnp.abs(gram)
     relative_rounding = _ROUNDING_UNITS * float(jnp.finfo(start.dtype).eps)
 
@@ -73,18 +78,18 @@ def find_multipliers(
 
     def step(state: _Newton) -> _Newton:
         newton = correction(residual, state.x, None)
-        # At most, this correction and the one before change each constraint by so much.
+        # The most that this correction, and the one before it, change each constraint.
         change = weighted_sum(jnp.abs(newton.change), slopes)
         change_before = weighted_sum(jnp.abs(state.correction), slopes) + rounding
-        # The change of the derivative along the correction before. The old derivative times
-        # that correction was `state.residual`, the residual that it was to remove. The
-        # change has the units of each constraint, so that none hides others.
+        # How much the derivative along the correction before has changed by it. The old
+        # derivative times that correction was `state.residual`, which it was to remove.
         bend = jnp.abs(newton.derivative(state.correction) - state.residual)
-        # The next correction is at most this fraction of this one. (Half of the bend is
-        # what was left to this one, and the square of the ratio of both is left to the
-        # next: Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.)
+        # The next correction is at most this fraction of this one. (Half of `bend` is what
+        # the correction before left to this one. The square of the ratio of these two is
+        # left to the next: Deuflhard, Newton Methods for Nonlinear Problems, 2004, section
+        # 2.1.) Ratios are taken constraint by constraint, since these differ in units.
         fraction = max_norm(change / change_before) * max_norm(bend / change_before)
-        # The first correction has none before it, and so no estimate of the next.
+        # The first correction has no other before it, from which to estimate the next one.
         fraction = jnp.where(state.remaining < _MOST_STEPS, fraction, 1)
         # The inequality is strict, since infinite corrections, for which both sides are
         # infinite, solve nothing.
@@ -113,7 +118,7 @@ def find_multipliers(
 def solve_tangent(apply: Callable, rhs: Multipliers) -> Multipliers:
     """Solves the linear equations `apply(x) = rhs` for the derivative of the multipliers,
     in the form that `lax.custom_root` asks for."""
-    # Its columns are the images of the unit vectors.
+    # The columns are the images of the unit vectors.
     matrix = jax.vmap(apply, out_axes=1)(jnp.eye(len(rhs), dtype=rhs.dtype))
     return solve_matrix(matrix, rhs)
 
@@ -125,19 +130,19 @@ def products(a: Float[Array, "c n"], b: Float[Array, "d n"]) -> Float[Array, "c 
 
 
 def weighted_sum(x: Multipliers, vectors: Float[Array, "c n"]) -> Vector:
-    """The sum of the vectors, the rows, times the numbers `x`."""
+    """The sum of the rows of `vectors`, each times its number in `x`."""
     # (c, n), summed over the first axis.
     return _total(x[:, None] * vectors)
 
 
-# Sums over axes up to this length are unrolled, so that XLA fuses them. On CPUs it calls a
-# library for each other sum or product of matrices: steps of rigid dimers took three times
-# as long.
+# Sums over axes up to this length are unrolled, so that XLA fuses them. For other sums and
+# for products of matrices, XLA calls a library on CPUs: with these, steps of rigid dimers
+# took three times as long.
 _MOST_UNROLLED = 32
 
 
 def _total(x: Float[Array, "n ..."]) -> Float[Array, "..."]:
     """The sum over the first axis."""
-    return (
-        ft.reduce(operator.add, x) if len(x) <= _MOST_UNROLLED else jnp.sum(x, axis=0)
-    )
+    if len(x) <= _MOST_UNROLLED:
+        return ft.reduce(operator.add, x)
+    return jnp.sum(x, axis=0)

@@ -1,5 +1,5 @@
-"""States that a constraint allows: found near others, and checked at the start of a
-solve."""
+"""States that a constraint allows: `constrained_state` finds one near a given state, and
+`check_start` checks the state at the start of a solve."""
 
 import diffrax
 import equinox as eqx
@@ -47,12 +47,13 @@ def check_start(
     """Checks that a solve with constraints can start at `y0`. Raises a `ValueError` for
     masses that are not constant.
 
-    Returns two flags: whether the constraints are dependent at `y0`, and whether `y0` is
-    off them. A flag that is true raises a `ValueError` if it is known, and otherwise an
-    error when run, except under `vmap`: there the caller makes its path fail."""
+    Returns two flags: whether the constraints are linearly dependent at `y0`, and whether
+    `y0` is off the constraints. A flag that is true raises a `ValueError` if it is known
+    while tracing, and otherwise an error when run. Under `vmap` nothing is raised, and the
+    caller has to make the path fail."""
     _check_constant_masses(terms, t0, y0, args)
-    # Flags have no derivative. Without this, `grad` would differentiate the checks all the
-    # same.
+    # Flags have no derivative. Without `stop_gradient`, `grad` would differentiate the
+    # operations of the checks all the same.
     fixed_y0, fixed_args = jtu.tree_map(
         lambda x: lax.stop_gradient(x) if eqx.is_inexact_array(x) else x, (y0, args)
     )
@@ -65,8 +66,8 @@ def check_start(
 def _start_faults(
     terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
 ) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
-    """Whether the constraints are dependent at `y0`, and, unless they are, whether `y0`
-    is off them."""
+    """Whether the constraints are linearly dependent at `y0`; and whether they are not, but
+    `y0` is off the constraints."""
     surface = Surface.of(terms, t0, y0, args)
     p0, q0 = y0
     p, _ = jfu.ravel_pytree(p0)
@@ -79,19 +80,19 @@ def _start_faults(
 def _check_constant_masses(
     terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
 ) -> None:
-    """Raises a `ValueError` unless the masses are constant: unless velocities are linear in
-    the momenta, up to a constant."""
+    """Raises a `ValueError` unless the masses are constant, that is, unless the velocities
+    are linear in the momenta up to a constant."""
     surface = Surface.of(terms, t0, y0, args)
     p0, _ = y0
     flat_p0, _ = jfu.ravel_pytree(p0)
 
-    # The change by an impulse is the second derivative of H0 by p, times the impulse.
+    # The second derivative of H0 by p, times an impulse, which is a change of the momentum.
     def change_of_velocity(p: Vector, impulse: Vector) -> Vector:
         _, change = jax.jvp(surface.velocity, (p,), (impulse,))
         return change
 
-    # The change may depend on the impulse, but not on the momentum: then the masses are
-    # constant. The second `flat_p0` stands for an impulse, of which only the shape counts.
+    # The masses are constant if this change depends on the impulse, but not on the momentum
+    # `p`. The second `flat_p0` stands for an impulse, of which only the shape counts.
     dependence = Dependence(change_of_velocity, flat_p0, flat_p0)
     if not dependence.independent(of=lambda p, impulse: p):
         raise ValueError(
@@ -171,19 +172,19 @@ def constrained_state(
 def _projection(
     terms: PyTree[diffrax.AbstractTerm], t: RealScalarLike, y0: PyTree, args: Args
 ) -> tuple[PyTree, Bool[Array, ""], Bool[Array, ""]]:
-    """The nearest allowed state, whether Newton's method found it, and whether the
-    constraints are dependent there."""
+    """An allowed state near `y0`, whether Newton's method found it, and whether the
+    constraints are linearly dependent there."""
     surface = Surface.of(terms, t, y0, args)
     p0, q0 = y0
     p, unravel_p = jfu.ravel_pytree(p0)
     q, unravel_q = jfu.ravel_pytree(q0)
-    # In a flight without momentum only the multipliers move the positions.
+    # In a free flight without momentum only the multipliers move the positions.
     no_momentum = jnp.zeros_like(p)
     normal_space = surface.normal_space(q)
     _, q, found = surface.free_flight(no_momentum, normal_space, time=1.0)
     normal_space = surface.normal_space(q)
-    # The second projection removes the rounding errors of the first, which matter if the
-    # momentum was nearly normal.
+    # The second projection removes the rounding errors of the first one. They matter if the
+    # momentum was nearly normal to the surface, so that little of it is left.
     p = surface.tangent(surface.tangent(p, normal_space), normal_space)
     y1 = (unravel_p(p), unravel_q(q))
     return y1, found, surface.is_dependent(normal_space)

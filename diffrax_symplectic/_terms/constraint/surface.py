@@ -1,5 +1,11 @@
 """The positions that a constraint allows and the momenta tangent to them: projections, and
-free flight."""
+free flight.
+
+Notation: positions `q`, momenta `p`, velocities `v`; the constraints `g(q) = 0` and their
+gradients, the rows of `J`; the inverse `M^-1` of the masses; the multipliers `lambda`. An
+impulse is a change of the momentum. That of a constraint force is a sum of gradients,
+`J^T x`.
+"""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -33,11 +39,12 @@ from .multipliers import (
 class NormalSpace(NamedTuple):
     """The directions normal to the surface at a position.
 
-    A step uses those at its ends and at its middle several times, so they are kept.
+    A step uses the directions at one position several times, so they are kept.
 
     - `q`: the position.
     - `normals`: the gradients of the constraints, `J`.
-    - `velocity_changes`: the changes of the velocity by impulses along them, `J M^-1`.
+    - `velocity_changes`: the change of the velocity by each gradient as an impulse,
+        `J M^-1`.
     - `gram`: `J M^-1 J^T`.
     """
 
@@ -48,12 +55,12 @@ class NormalSpace(NamedTuple):
 
 
 class Surface(NamedTuple):
-    """The positions that a constraint allows and the momenta tangent to them, `J v = 0`.
-    Both are vectors.
+    """The positions that a constraint allows, `g(q) = 0`, and the momenta tangent to them,
+    `J v = 0`. Positions and momenta are flat vectors here.
 
-    - `residual`: the constraint, as a function of the position.
-    - `velocity`: `v = dH0/dp` as a function of the momentum, which is linear up to a
-        constant: its derivative is the inverse of the masses, `M^-1`.
+    - `residual`: `g`, a function of the position.
+    - `velocity`: `v = dH0/dp`, a function of the momentum. It is linear up to a constant:
+        its derivative is the inverse of the masses, `M^-1`.
     """
 
     residual: Callable[[Vector], Multipliers]
@@ -76,7 +83,7 @@ class Surface(NamedTuple):
 
         def velocity(p: Vector) -> Vector:
             # H0 is separable, so any position gives the same velocity. Momenta have the
-            # structure of positions.
+            # structure of positions, so `unravel` serves for both.
             _, dq = rate(drift, t, (unravel(p), q0), args)
             flat, _ = jfu.ravel_pytree(dq)
             return flat
@@ -90,7 +97,7 @@ class Surface(NamedTuple):
         return NormalSpace(q, normals, changes, products(normals, changes))
 
     def _velocity_changes(self, impulses: Float[Array, "c n"]) -> Float[Array, "c n"]:
-        """The change of the velocity by each of these impulses, changes of the momentum."""
+        """The change of the velocity by each impulse, a row of `impulses`."""
         # The velocity is linear, so its derivative is the same at every momentum.
         zero = jnp.zeros_like(impulses[0])
 
@@ -106,18 +113,20 @@ class Surface(NamedTuple):
         normal_space: NormalSpace,
         response: Callable[[Vector], Vector] | None = None,
     ) -> Vector:
-        """The tangent momentum: `p` after those impulses of the constraint forces that make
-        it tangent. An impulse `x` changes the momentum by `x`; or by `response(x)`, for
-        example if friction acts on it, too."""
-        # The change of the momentum by a unit impulse along each normal, (c, n), and the
-        # change of J v by it.
+        """The momentum `p` after the impulses of the constraint forces that make it
+        tangent.
+
+        By default an impulse `x` changes the momentum by `x`. With `response` it changes
+        the momentum by `response(x)`, for example if friction acts on the impulse."""
+        # `changes`: the change of the momentum by each normal as an impulse, (c, n).
+        # `gram`: the change of `J v` by each of `changes`, (c, c).
         if response is None:
             gram = normal_space.gram
             changes = normal_space.normals
         else:
             changes = jax.vmap(response)(normal_space.normals)
             gram = products(normal_space.normals, self._velocity_changes(changes))
-        # J v, the speeds at which the momentum `p` would leave the surface.
+        # `J v`, the speeds at which the momentum `p` would leave the surface.
         speeds = products(normal_space.normals, self.velocity(p)[None])[:, 0]
         return p - weighted_sum(solve_matrix(gram, speeds), changes)
 
@@ -128,46 +137,52 @@ class Surface(NamedTuple):
         time: RealScalarLike,
         pending: Bool[Array, ""] | bool = True,
     ) -> tuple[Vector, Vector, Bool[Array, ""]]:
-        r"""Free flight on the surface over `time`, by a step of RATTLE,
+        r"""Free flight on the surface over the `time` $h$, by a step of RATTLE,
 
-        $$q_1 = q + h\, v(p_1), \qquad p_1 = p - J(q)^\top \lambda, \qquad g(q_1) = 0,$$
+        $$q_1 = q + h\, v(p_1), \qquad p_1 = p - J(q)^\top \lambda, \qquad g(q_1) = 0.$$
 
-        and whether the multipliers were found. The momentum $p_1$ still has to be made
-        tangent at $q_1$. The momentum $p$ need not be tangent: the multipliers make up for
-        the difference. Nothing is solved for, nor found, if not `pending`.
+        Returns $p_1$, $q_1$ and whether the multipliers $\lambda$ were found. If not
+        `pending`, nothing is solved, and they are not found.
+
+        The momentum $p_1$ still has to be made tangent at $q_1$. The momentum $p$ need not
+        be tangent: the multipliers make up for its normal part.
         """
         time = jnp.asarray(time, p.dtype)
         # The position without constraint forces.
         unconstrained_q = normal_space.q + time * self.velocity(p)
         rounding = _rounding(normal_space, unconstrained_q)
 
-        # The unknowns are `time * lambda`, so that `time` may be small.
-        def position(x: Multipliers) -> Vector:
+        # The unknowns are `x = h lambda`, since the position hardly depends on `lambda` if
+        # `h` is small. The impulse `-J^T lambda` changes the velocity by
+        # `-M^-1 J^T lambda`, and so the position after the time `h` by `-M^-1 J^T x`.
+        def end_position(x: Multipliers) -> Vector:
             return unconstrained_q - weighted_sum(x, normal_space.velocity_changes)
 
-        def residual(x: Multipliers) -> Multipliers:
-            return self.residual(position(x))
+        # The left-hand side of the equation to solve, `g(q_1) = 0`.
+        def equation(x: Multipliers) -> Multipliers:
+            return self.residual(end_position(x))
 
-        def solve(residual: Callable, start: Multipliers) -> tuple[Multipliers, Array]:
+        def solve(fn: Callable, start: Multipliers) -> tuple[Multipliers, Array]:
             x, found = find_multipliers(
-                residual, normal_space.gram, rounding, start, jnp.asarray(pending)
+                fn, normal_space.gram, rounding, start, jnp.asarray(pending)
             )
             # The flag becomes a float: `custom_root` gives other types a tangent of a wrong
             # type.
             return x, found.astype(x.dtype)
 
-        # Derivatives come from the equations, and not through the loop that solves them.
-        start = jnp.zeros(len(normal_space.gram), p.dtype)
-        x, found = lax.custom_root(residual, start, solve, solve_tangent, has_aux=True)
-        return p - weighted_sum(x / time, normal_space.normals), position(x), found > 0
+        # Derivatives come from the equation, and not through the loop that solves it.
+        zeros = jnp.zeros(len(normal_space.gram), p.dtype)
+        x, found = lax.custom_root(equation, zeros, solve, solve_tangent, has_aux=True)
+        p1 = p - weighted_sum(x / time, normal_space.normals)
+        return p1, end_position(x), found > 0
 
     def is_dependent(self, normal_space: NormalSpace) -> Bool[Array, ""]:
         """Whether the normals are linearly dependent, up to rounding errors."""
         # Backward in time, velocities change their sign, and with them the Gram matrix.
         gram = normal_space.gram * jnp.sign(jnp.trace(normal_space.gram))
         lengths = jnp.sqrt(jnp.diag(gram))
-        # The cosines of the angles between normals. The pivots of their Cholesky factor are
-        # the squared sines of the angles between each normal and the space of those before.
+        # The cosines of the angles between normals. Each pivot of their Cholesky factor is
+        # the squared sine of the angle between a normal and the space of those before it.
         cosines = gram / lengths / lengths[:, None]
         pivots = jnp.diag(jnp.linalg.cholesky(cosines)) ** 2
         rounding = 1000 * jnp.finfo(gram.dtype).eps
@@ -177,13 +192,13 @@ class Surface(NamedTuple):
 
     def is_off(self, p: Vector, normal_space: NormalSpace) -> Bool[Array, ""]:
         """Whether a state is farther from the surface than rounding errors explain."""
-        # Two thirds of the digits have to agree. This bound lies between rounding errors,
-        # also of long sums, and any mistake of the user's.
+        # Two thirds of the digits have to agree. This bound lies above the rounding errors
+        # of long sums, and below what a mistake of the user's gives.
         eps = float(jnp.finfo(p.dtype).eps)
         bound = eps ** (2 / 3)
         q = normal_space.q
-        # The size of the terms that cancel in each constraint, by the size of the positions
-        # or, near the origin, by the curvature of the surface.
+        # Each constraint is zero since terms of this size cancel in it. The size follows
+        # from that of the positions or, near the origin, from the curvature of the surface.
         size = jnp.maximum(
             _rounding(normal_space, q) / eps, self._size_by_curvature(normal_space)
         )
@@ -193,26 +208,26 @@ class Surface(NamedTuple):
         return ~(position_is_on & momentum_is_tangent)
 
     def _size_by_curvature(self, normal_space: NormalSpace) -> Float[Array, " c"]:
-        r"""The size of the terms that cancel in each constraint $g$, such as one for $q^2
-        - 1$: its gradient times its radius of curvature, $|g'| \cdot |g'| / |g''|$, with
-        $g''$ along an arbitrary direction. Zero for a plane.
+        r"""An estimate of the size of the terms that cancel in each constraint $g$, such as
+        one for $q^2 - 1$. Zero for a plane.
 
-        A constraint rounds as its positions do, or, where these are near the origin, as
-        these terms do.
+        It is the gradient times the radius of curvature, $|g'| \cdot |g'| / |g''|$, with
+        $g''$ along an arbitrary direction. It matters near the origin: there the positions
+        are smaller than these terms, and so are their rounding errors.
         """
         q = normal_space.q
-        # No symmetry singles out this direction.
+        # An arbitrary direction, which no symmetry of the constraint singles out.
         direction = jnp.cos(1.0 + jnp.arange(len(q), dtype=q.dtype))
         _, gradient_changes = jax.jvp(jax.jacrev(self.residual), (q,), (direction,))
-        # Both are sums over the positions, the last axis.
+        # Sums over the positions, the last axis.
         curvatures = jnp.sum(jnp.abs(gradient_changes), axis=1)
         squared_gradients = jnp.sum(normal_space.normals**2, axis=1)
         return squared_gradients / jnp.where(curvatures > 0, curvatures, jnp.inf)
 
 
 def _rounding(normal_space: NormalSpace, q: Vector) -> Multipliers:
-    """The rounding error of each constraint: the most that it changes if all positions `q`
-    change by one unit in the last place."""
+    """The rounding error of each constraint: its largest change if each entry of the
+    position `q` changes by one unit in the last place."""
     info = jnp.finfo(q.dtype)
     last_places = float(info.eps) * jnp.abs(q)
     changes = products(jnp.abs(normal_space.normals), last_places[None])[:, 0]
@@ -227,7 +242,7 @@ def _checked_values(
     shape `(c,)`."""
     value = call_user_function("constraint", constraint, q, args=args)
     if not is_real_number(value) or jnp.ndim(value) != 1 or jnp.size(value) == 0:
-        # This names the dtype, too, as in `f32[2]`: it alone may be wrong.
+        # The dtype and the shape, as in `f32[2]`: either may be wrong.
         got = eqx.tree_pformat(value, struct_as_array=True)
         raise ValueError(
             "`constraint(q, args)` must return a real array of shape `(c,)`, one number "

@@ -1,8 +1,8 @@
 """Langevin dynamics: friction on velocities, and the noise of a temperature.
 
 - `terms`: `langevin_terms` and `bath_terms`.
-- `friction`: the forms of friction, numbers, a matrix or directions, and its root in the
-  noise.
+- `friction`: the forms of a friction (numbers, a matrix or directions), the force of
+  friction, and the root of the friction in the noise.
 - `diffrax_langevin`: Diffrax's own Langevin terms, with their state `(x, v)`.
 """
 

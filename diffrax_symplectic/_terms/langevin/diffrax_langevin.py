@@ -1,5 +1,8 @@
-"""Diffrax's own terms for Langevin dynamics, with the velocity in the place of the
-momentum."""
+"""Diffrax's own terms for Langevin dynamics, as terms of this package.
+
+Diffrax's state is `(x, v)`: positions and velocities. Here the velocities take the place of
+the momenta, which come first: `(v, x)`.
+"""
 
 import diffrax
 import jax.numpy as jnp
@@ -21,9 +24,9 @@ _Half = PyTree[Array]
 def momentum_first(
     terms: PyTree[diffrax.AbstractTerm], y: PyTree
 ) -> tuple[PyTree[diffrax.AbstractTerm], PyTree]:
-    """Diffrax's Langevin terms as terms with the velocity in the place of the momentum, and
-    the halves of their state `(x, v)` exchanged. Other terms and their states are returned
-    as they are."""
+    """Diffrax's Langevin terms as terms of the state `(v, x)`, and this state for
+    `y = (x, v)`. Terms without Diffrax's Langevin drift are returned as they are, with
+    their state."""
     parts = flattened(terms)
     own_parts = map(unwrapped, parts)
     if not any(isinstance(x, diffrax.UnderdampedLangevinDriftTerm) for x in own_parts):
@@ -37,8 +40,9 @@ def momentum_first(
 
 
 def _exchanged(term: diffrax.AbstractTerm) -> list[diffrax.AbstractTerm]:
-    """A term of the state `(x, v)` as terms of `(v, x)`. Of Diffrax's Langevin drift, the
-    friction becomes a term of its own, which solvers for heat baths find."""
+    """A term of the state `(x, v)` as terms of the state `(v, x)`. The friction of
+    Diffrax's Langevin drift becomes a term of its own, which solvers for heat baths find.
+    """
     if isinstance(term, diffrax.UnderdampedLangevinDriftTerm):
         # The `gamma` of Diffrax acts on velocities of mass one, as the friction here does.
         friction = _PrefixFriction(term.gamma)
@@ -53,8 +57,9 @@ def _exchanged(term: diffrax.AbstractTerm) -> list[diffrax.AbstractTerm]:
 def _frictionless_field(
     term: diffrax.UnderdampedLangevinDriftTerm, t, y: tuple[_Half, _Half], args: Args
 ) -> tuple[_Half, _Half]:
+    """The vector field of Diffrax's Langevin drift without friction, for `y = (v, x)`."""
     v, x = y
-    # Without velocity there is no friction, so only the forces are left.
+    # Without velocity there is no friction, so `dv` is the force alone.
     _, dv = term.vf(t, (x, jtu.tree_map(jnp.zeros_like, v)), args)
     return dv, v
 
@@ -62,14 +67,15 @@ def _frictionless_field(
 def _exchanged_field(
     term: diffrax.ODETerm, t, y: tuple[_Half, _Half], args: Args
 ) -> tuple[_Half, _Half]:
+    """The vector field of `term`, a term of `(x, v)`, for `y = (v, x)`."""
     v, x = y
     dx, dv = term.vf(t, (x, v), args)
     return dv, dx
 
 
 class _PrefixFriction(AbstractFriction):
-    """The friction of Diffrax's Langevin term. Its `gamma` may be a prefix of the
-    velocity."""
+    """The friction of Diffrax's Langevin term. The structure of its `gamma` may be a prefix
+    of that of the velocities, as for `jax.vmap`."""
 
     gamma: PyTree[ArrayLike]
 
@@ -84,7 +90,7 @@ class _PrefixFriction(AbstractFriction):
     def force(self, t, q, args, velocity):
         del t, q, args
 
-        # One leaf of `gamma` may be that of several arrays of velocities.
+        # One leaf of `gamma` may stand for several arrays of velocities, a subtree.
         def force_on_subtree(gamma: ArrayLike, subtree: _Half) -> _Half:
             return jtu.tree_map(
                 lambda v: -not_negative(in_precision_of(gamma, v)) * v, subtree
@@ -94,7 +100,7 @@ class _PrefixFriction(AbstractFriction):
 
 
 class _ExchangedNoise(diffrax.AbstractTerm):
-    """A noise term of the state `(x, v)`, as one of `(v, x)`."""
+    """A noise term of the state `(x, v)`, as a noise term of the state `(v, x)`."""
 
     term: diffrax.AbstractTerm
 

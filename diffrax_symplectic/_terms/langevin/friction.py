@@ -1,5 +1,14 @@
-"""The forms of friction, numbers, a matrix or directions, and its root in the noise of a
-temperature."""
+"""The forms of the friction `G`, and the products that a Langevin equation needs: `G v` for
+the force of friction, and `B w` with `B B^T = 2 T G` for the noise of a temperature `T`.
+
+A friction has one of three forms:
+
+- numbers for each array of the momenta, which multiply them entry by entry;
+- a matrix: an operator of Lineax, or a `_Matrix` if it is constant;
+- directions: a `FrictionAlong`.
+
+Numbers and matrices may also be the values of a function `(t, q, args)`.
+"""
 
 from collections.abc import Callable
 from typing import Any
@@ -21,11 +30,11 @@ from ..evaluation import call_user_function
 
 # Momenta, velocities or positions: an array, or a PyTree of arrays.
 _HalfState = PyTree[Array]
-# A temperature, constant or a function.
+# A temperature, constant or a function; also a friction by numbers.
 Value = (
     PyTree[ArrayLike] | Callable[[RealScalarLike, _HalfState, Args], PyTree[ArrayLike]]
 )
-# A friction, constant or a function, except for directions.
+# A friction by numbers or a matrix, constant or a function.
 FrictionValue = (
     Value
     | lx.AbstractLinearOperator
@@ -42,6 +51,9 @@ _PASS_BLOCKS = (
     "jax.eval_shape(lambda: q), lineax.positive_semidefinite_tag)` with an array of shape "
     "`(n, d, n, d)`"
 )
+# What a friction has to fit, in messages before the solve. Only the path is known then, and
+# the path may be what is wrong.
+_PATH_AND_MOMENTA = "the `path` and the momenta"
 
 
 class FrictionAlong(AbstractCaller):
@@ -70,11 +82,11 @@ class FrictionAlong(AbstractCaller):
 
 
 class _Matrix(eqx.Module):
-    """A constant matrix of friction, for momenta as a vector, with what would take long in
-    every step. NaN if it is not symmetric positive semidefinite.
+    """A constant matrix of friction, for momenta flattened to a vector. Its root, which
+    takes long to compute, is kept for all steps.
 
-    - `matrix`: the matrix.
-    - `root`: its root.
+    - `matrix`: the matrix `G`; NaN if it is not symmetric positive semidefinite.
+    - `root`: `L` with `L L^T = G`, or NaN.
     - `structure`: the structure, shapes and dtypes of the momenta.
     """
 
@@ -94,11 +106,11 @@ def value_at(name: str, value: Any, t, q: _HalfState, args: Args) -> Any:
 def product_with(
     friction: Any, t, q: _HalfState, args: Args, velocity: _HalfState
 ) -> _HalfState:
-    """`G v` for the user's `friction` G in any of its forms. NaN where numbers are
-    negative, or a constant matrix is not semidefinite."""
+    """`G v` for the user's friction `G` in any of its forms, and `v = velocity`. NaN where
+    numbers are negative, or if a constant matrix is not semidefinite."""
     if isinstance(friction, FrictionAlong):
-        # G v = sum_k d_k (d_k . v), which costs less than to form the matrix. In the scalar
-        # products each array of momenta is one summand.
+        # G v = sum_k d_k (d_k . v), which costs less than to form the matrix. Each array of
+        # momenta gives one summand of the scalar products `d_k . v`.
         columns = _checked_columns(friction, t, q, args)
         speeds = jtu.tree_map(
             lambda d, v: jnp.tensordot(v, d, axes=jnp.ndim(v)), columns, velocity
@@ -107,8 +119,8 @@ def product_with(
         return jtu.tree_map(lambda directions: directions @ total_speeds, columns)
     value = value_at("friction", friction, t, q, args)
     if _is_matrix(value):
-        # Whether the value of a function is semidefinite is checked where the noise takes
-        # its root.
+        # A matrix from a function may not be semidefinite. Then its root in the noise is
+        # NaN.
         matrix = _checked_matrix(value, q, "the momenta")
         flat_v, unravel = jfu.ravel_pytree(velocity)
         return unravel(in_precision_of(matrix, flat_v) @ flat_v)
@@ -121,13 +133,15 @@ def product_with(
 def root_product_with(
     friction: Any, T: PyTree, t, q: _HalfState, args: Args, control: BM
 ) -> _HalfState:
-    """`B W` for the increments `W = control`, with `B B^T = 2 T G`. Raises a `ValueError`
-    if their shapes do not fit the friction or the momenta."""
+    """`B w` for the user's friction `G` in any of its forms and the increments
+    `w = control`, with `B B^T = 2 T G`. Raises a `ValueError` if the shapes of the
+    increments do not fit the friction or the momenta."""
     if isinstance(friction, FrictionAlong):
+        # B = sqrt(2 T) (d_1, ..., d_m), one column for each direction.
         columns = _checked_columns(friction, t, q, args)
         T = _checked_single_temperature(T)
         flat_w, _ = jfu.ravel_pytree(control)
-        # The shape `(m,)` for `m` directions, which all arrays share.
+        # `(m,)` for `m` directions. All arrays of momenta have the same directions.
         noise_shape = jnp.shape(jtu.tree_leaves(columns)[0])[-1:]
         if noise_shape != flat_w.shape:
             raise ValueError(
@@ -147,6 +161,7 @@ def root_product_with(
         )
     value = value_at("friction", friction, t, q, args)
     if _is_matrix(value):
+        # B = sqrt(2 T) L with L L^T = G.
         matrix = _checked_matrix(value, q, "the momenta")
         root = value.root if isinstance(value, _Matrix) else _root_of_matrix(matrix)
         flat_q, unravel = jfu.ravel_pytree(q)
@@ -154,11 +169,12 @@ def root_product_with(
         scale = _root(2 * in_precision_of(_checked_single_temperature(T), flat_q))
         w = in_precision_of(flat_w, flat_q)
         return unravel(scale * (in_precision_of(root, flat_q) @ w))
+    # G and B are diagonal.
     numbers = _checked_numbers("friction", value, q)
     temperatures = _checked_numbers("temperature", T, q)
 
     def kick(g: ArrayLike, T: ArrayLike, w: Array, x: Array) -> Array:
-        # Where either is negative, NaN makes the path fail.
+        # Where `g` or `T` is negative, its root is NaN, which makes the path fail.
         scale = _root(in_precision_of(g, x)) * _root(2 * in_precision_of(T, x))
         return scale * in_precision_of(w, x)
 
@@ -172,19 +188,23 @@ def _have_same_shapes(a: PyTree, b: PyTree) -> bool:
 
 
 def _is_matrix(friction: Any) -> bool:
+    """Whether a friction is a matrix, constant or the value of a function."""
     return isinstance(friction, _Matrix | lx.AbstractLinearOperator)
 
 
 def _root_of_matrix(matrix: Array) -> Float[Array, "n n"]:
+    """The `semidefinite_root` of a matrix, also of integers."""
     return semidefinite_root(jnp.asarray(matrix, jnp.result_type(matrix, float)))
 
 
 def _checked_matrix(
     friction: _Matrix | lx.AbstractLinearOperator, momenta: PyTree, called: str
 ) -> Array:
-    """The matrix of the friction, for momenta as a vector. Raises a `ValueError` unless an
-    operator is tagged as positive semidefinite, and maps PyTrees with the structure and
-    shapes of `momenta` to such PyTrees. The message calls these `called`."""
+    """The matrix of a friction, for momenta flattened to a vector.
+
+    Raises a `ValueError` unless the friction acts on PyTrees with the structure and shapes
+    of `momenta`, which the message calls `called`. Also raises one if an operator is not
+    tagged as positive semidefinite."""
     if isinstance(friction, _Matrix):
         structure = friction.structure
     elif lx.is_positive_semidefinite(friction):
@@ -206,15 +226,15 @@ def _checked_matrix(
 def _checked_columns(
     friction: FrictionAlong, t, q: _HalfState, args: Args
 ) -> _HalfState:
-    """The directions for each array of the momenta, with a trailing axis of noises. Raises
-    a `ValueError` if their shapes do not fit the momenta."""
+    """The directions of a friction: for each array of the momenta an array with one more
+    axis, of noises. Raises a `ValueError` if their shapes do not fit the momenta."""
     columns = value_at("directions", friction.directions, t, q, args)
     columns = _value_for_each("directions", columns, q)
 
     def fits(column: ArrayLike, momenta: Array) -> bool:
         return jnp.ndim(column) > 0 and jnp.shape(column)[:-1] == jnp.shape(momenta)
 
-    # All arrays have the same directions, so their last axes agree.
+    # The last axis counts the directions, so it is as long in all arrays.
     last_axes = {jnp.shape(column)[-1:] for column in jtu.tree_leaves(columns)}
     if len(last_axes) > 1 or not jtu.tree_all(jtu.tree_map(fits, columns, q)):
         raise ValueError(
@@ -228,22 +248,20 @@ def _checked_columns(
 def _checked_numbers(
     name: str, value: PyTree, momenta: PyTree, called: str = "its momenta"
 ) -> PyTree:
-    """The friction or temperature in the user's argument `name`, as numbers for each array
-    of the `momenta`. Messages call the momenta `called`, since a path may stand in for
-    them.
+    """The numbers of the user's argument `name`, a friction or temperature, in the
+    structure of the momenta. Messages call the momenta `called`, since `momenta` may be a
+    path in their place.
 
-    Raises a `ValueError` unless these are a single number, or an array with as many axes as
-    the momenta, each as long as theirs or one. (NumPy would also add axes in front. So for
-    three particles in space `(3,)` would be one number for each axis of space, and more
-    often one for each particle is meant.)"""
+    For each array of the momenta, raises a `ValueError` unless the argument has a single
+    number, or an array with as many axes, each as long as that of the momenta or of length
+    one. (NumPy would also add axes in front. For three particles in space, an array of
+    shape `(3,)` would then hold one number for each axis of space. More often one for each
+    particle is meant.)"""
     values = _value_for_each(name, value, momenta)
     for x, of_momenta in zip(jtu.tree_leaves(values), jtu.tree_leaves(momenta)):
         shape = jnp.shape(x)
         momenta_shape = jnp.shape(of_momenta)
-        fits = len(shape) == len(momenta_shape) and all(
-            length in (1, of_axis) for length, of_axis in zip(shape, momenta_shape)
-        )
-        if shape == () or fits:
+        if shape == () or _fits_axis_by_axis(shape, momenta_shape):
             continue
         advice = ""
         if len(momenta_shape) > 1 and shape == momenta_shape[:1]:
@@ -260,14 +278,20 @@ def _checked_numbers(
     return values
 
 
+def _fits_axis_by_axis(shape: tuple[int, ...], momenta_shape: tuple[int, ...]) -> bool:
+    """Whether an array has as many axes as the momenta, each of their length or of one."""
+    pairs = zip(shape, momenta_shape)
+    all_fit = all(length in (1, momenta_length) for length, momenta_length in pairs)
+    return len(shape) == len(momenta_shape) and all_fit
+
+
 def _value_for_each(name: str, value: PyTree, p: PyTree) -> PyTree:
-    """The user's argument `name`, a value for each array of momenta, in the structure of
-    the momenta `p`: a single value is that of each array. Raises a `ValueError` if it has
-    another structure."""
+    """The user's argument `name` in the structure of the momenta `p`. A single value is
+    repeated for each array of momenta. Raises a `ValueError` for any other structure."""
     if jtu.all_leaves([value]):
         return jtu.tree_map(lambda _: value, p)
     if jtu.tree_structure(value) != jtu.tree_structure(p):
-        # The momenta may be given by their shapes.
+        # The momenta may be arrays or only their shapes. Both are shown by their shapes.
         momenta = eqx.tree_pformat(p, struct_as_array=True)
         advice = ""
         if isinstance(value, list | tuple):
@@ -280,8 +304,8 @@ def _value_for_each(name: str, value: PyTree, p: PyTree) -> PyTree:
 
 
 def _checked_single_temperature(T: PyTree) -> ArrayLike:
-    """The temperature. Raises a `ValueError` unless it is one number. (With several,
-    friction that mixes momenta has no stationary density that is known.)"""
+    """The temperature `T`. Raises a `ValueError` unless it is one number. (With several
+    temperatures, no stationary density is known for friction that mixes momenta.)"""
     if not jtu.all_leaves([T]) or jnp.shape(T) != ():
         raise ValueError(
             "`temperature` must be one number for friction by a matrix or along "
@@ -297,51 +321,45 @@ def not_negative(friction: Array) -> Array:
 
 
 def _root(x: Array) -> Array:
-    """The square root, with the derivative zero at zero, and NaN of negative numbers.
+    """The square root, with the derivative zero at zero; NaN for negative numbers.
 
-    A friction or temperature that is zero in a part of space, or for some momenta, stays
-    zero along most directions. The infinite derivative of `jnp.sqrt`, times zero, would
-    make the derivatives along these NaN.
+    A friction or temperature may be zero in a part of space. There its derivatives are zero
+    along most directions. Times the derivative of `jnp.sqrt` at zero, which is infinite,
+    they would become NaN.
     """
     positive = x > 0
+    # Both branches of a `where` are differentiated, so neither may have an infinite
+    # derivative.
     root = jnp.sqrt(jnp.where(positive, x, 1))
-    # At zero the result is a constant, and not `x`, which would hand its derivative on.
+    # At zero the result is the constant 0.0, and not `x`, whose derivative is not zero.
     return jnp.where(positive, root, jnp.where(x == 0, 0.0, jnp.nan).astype(x.dtype))
 
 
 def in_precision_of(x: ArrayLike, other: Array) -> Array:
-    """`x` in the precision of `other`."""
+    """`x` with the dtype of `other`."""
     return jnp.asarray(x, jnp.result_type(other))
 
 
 def checked_friction(
     friction: Any, path_struct: PyTree[jax.ShapeDtypeStruct] | None
 ) -> Any:
-    """The friction, with the root of a constant matrix, for a path with increments like
-    `path_struct`, or without a path. Raises a `ValueError` if it is known to be invalid."""
-    # Before the solve only the shape of the path is known. If the friction does not fit it,
-    # the path or the friction may be wrong, so messages name what both have to fit.
-    what_it_fits = "the `path` and the momenta"
+    """The user's friction in the form in which terms hold it. Raises a `ValueError` if the
+    friction is known to be invalid.
+
+    - A `FrictionAlong` has its directions in arrays, or as a function.
+    - A constant matrix becomes a `_Matrix`, with its root.
+    - A function stays as it is.
+    - Numbers become arrays.
+
+    `path_struct` has the shapes of the increments of the path; it is `None` without a path.
+    """
     if isinstance(friction, FrictionAlong):
         if not callable(friction.directions):
             return jtu.tree_map(jnp.asarray, friction)
         check_takes("directions", friction.directions, "t", "q", "args")
         return friction
     if isinstance(friction, lx.AbstractLinearOperator):
-        # Without a path the operator is compared with its own structure here, and with the
-        # momenta in the solve.
-        structure = friction.in_structure()
-        momenta = structure if path_struct is None else path_struct
-        matrix = _checked_matrix(friction, momenta, what_it_fits)
-        # The root of any other matrix than a semidefinite one is NaN.
-        root = _root_of_matrix(matrix)
-        is_semidefinite = ~jnp.any(jnp.isnan(root))
-        if not is_traced(is_semidefinite) and not is_semidefinite:
-            raise ValueError(
-                "`friction` must be a symmetric positive semidefinite matrix; got "
-                f"{matrix}."
-            )
-        return _Matrix(jnp.where(is_semidefinite, matrix, jnp.nan), root, structure)
+        return _constant_matrix(friction, path_struct)
     if callable(friction):
         check_takes("friction", friction, "t", "q", "args")
         return friction
@@ -352,12 +370,38 @@ def checked_friction(
             f"{friction!r}."
         )
     if path_struct is not None:
-        _checked_numbers("friction", friction, path_struct, what_it_fits)
+        # Only the errors of this check are wanted. The numbers themselves are brought into
+        # the structure of the momenta in the solve, where the momenta are known.
+        _checked_numbers("friction", friction, path_struct, _PATH_AND_MOMENTA)
     return _checked_arrays("friction", friction)
 
 
+def _constant_matrix(
+    operator: lx.AbstractLinearOperator,
+    path_struct: PyTree[jax.ShapeDtypeStruct] | None,
+) -> _Matrix:
+    """The matrix of a constant friction, with its root. Raises a `ValueError` if it does
+    not fit the path, or if it is known not to be symmetric positive semidefinite."""
+    structure = operator.in_structure()
+    # Without a path the operator is compared with the momenta only in the solve.
+    momenta = structure if path_struct is None else path_struct
+    matrix = _checked_matrix(operator, momenta, _PATH_AND_MOMENTA)
+    # The root is NaN if the matrix is not symmetric positive semidefinite.
+    root = _root_of_matrix(matrix)
+    is_semidefinite = ~jnp.any(jnp.isnan(root))
+    if not is_traced(is_semidefinite) and not is_semidefinite:
+        raise ValueError(
+            f"`friction` must be a symmetric positive semidefinite matrix; got {matrix}."
+        )
+    # A traced matrix could not raise the error above. Where it is not semidefinite, NaN
+    # makes the path fail, also if there is no noise, which would take the root.
+    matrix = jnp.where(is_semidefinite, matrix, jnp.nan)
+    return _Matrix(matrix, root, structure)
+
+
 def checked_temperature(temperature: Any) -> Any:
-    """The temperature, in arrays. Raises a `ValueError` if it is known to be invalid."""
+    """The user's temperature: numbers as arrays, or a function as it is. Raises a
+    `ValueError` if the temperature is known to be invalid."""
     if callable(temperature):
         check_takes("temperature", temperature, "t", "q", "args")
         return temperature
@@ -365,8 +409,8 @@ def checked_temperature(temperature: Any) -> Any:
 
 
 def _checked_arrays(name: str, values: PyTree[ArrayLike]) -> PyTree[Array]:
-    """The numbers in the user's argument `name`, in arrays. Raises a `ValueError` if they
-    are known to be invalid."""
+    """The numbers in the user's argument `name`, as arrays. Raises a `ValueError` if one is
+    known to be negative or not finite."""
 
     def checked(x: ArrayLike) -> Array:
         return jnp.asarray(checked_not_negative(name, x, expected=_EXPECTED))
@@ -377,29 +421,31 @@ def _checked_arrays(name: str, values: PyTree[ArrayLike]) -> PyTree[Array]:
 # With `jit` this function is traced and compiled once for each shape.
 @jax.jit
 def semidefinite_root(square: Float[Array, "n n"]) -> Float[Array, "n n"]:
-    r"""$L$ with $L L^\top$ equal to a symmetric positive semidefinite matrix: its Cholesky
-    factor, with zero columns where the matrix is singular. NaN if it is no such matrix.
+    r"""The matrix $L$ with $L L^\top$ equal to `square`, a symmetric positive semidefinite
+    matrix: its Cholesky factor, with zero columns where `square` is singular. NaN if
+    `square` is not symmetric positive semidefinite.
 
-    A column is zero if its pivot is a rounding error, whose root would be far larger than
-    one: a friction between particles would then change their total momentum.
+    A pivot that is a rounding error gives a zero column. Its root would be far larger than
+    a rounding error: with it, a friction between particles would change their total
+    momentum.
     """
     n = len(square)
     eps = jnp.finfo(square.dtype).eps
     diagonal = jnp.diag(square)
-    # The error of a pivot, which is a difference of numbers up to the diagonal entry. A
-    # column is left out where its pivot is not larger.
+    # The rounding error of each pivot, a difference of numbers up to the diagonal entry.
     rounding = 10 * n * eps * diagonal
-    # No entry (i, j) of a semidefinite matrix is larger than the root of the product of the
-    # diagonal entries i and j. One of these is below `rounding` where a column was left
-    # out, which gives a bound on what is left of a semidefinite matrix at the end.
+    # A bound on the remainder of a semidefinite matrix after all columns. Its entry (i, j)
+    # is at most the root of the product of its diagonal entries i and j. Entries are left
+    # only for columns that are zero, where the diagonal entry is below `rounding`.
     root_of_diagonal = jnp.sqrt(jnp.maximum(diagonal, 0))
     largest_remainder = (
         10 * (n * eps) ** 0.5 * root_of_diagonal[:, None] * root_of_diagonal
     )
 
     def with_column(j: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        """The remainder of the matrix after column `j` of the root, the root with this
-        column, and whether the matrix may still be semidefinite."""
+        """One step of Cholesky's method: `carry` after column `j` of the root. It holds the
+        remainder of the matrix, the columns of the root so far, and whether the matrix may
+        still be semidefinite."""
         remainder, root, is_valid = carry
         pivot = remainder[j, j]
         is_used = pivot > rounding[j]
@@ -412,10 +458,9 @@ def semidefinite_root(square: Float[Array, "n n"]) -> Float[Array, "n n"]:
     asymmetry = jnp.max(jnp.abs(square - square.T))
     is_symmetric = asymmetry <= 100 * eps * jnp.max(jnp.abs(square))
     is_valid = is_symmetric & jnp.all(jnp.isfinite(square))
-    # The remainder, the root and whether the matrix may be semidefinite, before any column.
     carry = (square, jnp.zeros_like(square), is_valid)
-    # The loop is unrolled for all matrices that the fused engine solves with: the engine
-    # takes no column whose number is known only when it runs.
+    # The loop is unrolled for all sizes that the fused engine takes: the engine needs the
+    # number `j` of a column before it runs.
     carry = jax.lax.fori_loop(0, n, with_column, carry, unroll=n <= 16)
     remainder, root, is_valid = carry
     is_valid = is_valid & jnp.all(jnp.abs(remainder) <= largest_remainder)

@@ -127,9 +127,8 @@ def langevin_terms(
         made_by="langevin_terms",
         friction=friction_term.vector_field,
     )
-    return diffrax.MultiTerm(
-        with_constraint(diffrax.ODETerm(field), constraint), *noise
-    )
+    drift = with_constraint(diffrax.ODETerm(field), constraint)
+    return diffrax.MultiTerm(drift, *noise)
 
 
 def bath_terms(
@@ -160,7 +159,8 @@ def bath_terms(
         return diffrax.MultiTerm(diffrax.ODETerm(field))
     path = as_path(path)
     if isinstance(path, TruncatedBrownianPath):
-        # `solver.path` truncates without knowing the terms. Here it would cool the bath.
+        # `solver.path` may truncate increments, without knowing the terms. Truncated
+        # increments would cool the bath.
         path = path.path
     field = Friction(H0, checked_friction(friction, increment_struct(path)))
     # Both terms hold the same friction, so that they cannot get out of balance.
@@ -169,7 +169,8 @@ def bath_terms(
 
 
 class Friction(AbstractFriction):
-    """The vector field `(-G dH0/dp, 0)`."""
+    """The vector field `(-G dH0/dp, 0)` of a friction `G`, in one of the forms that
+    `checked_friction` returns."""
 
     H0: _Hamiltonian
     friction: Any
@@ -191,7 +192,8 @@ class Friction(AbstractFriction):
 
 
 class BathNoise(AbstractNoise):
-    """The noise `(B dw, 0)` with `B B^T = 2 T G`."""
+    """The noise `(B dw, 0)` with `B B^T = 2 T G`, for the friction `G` and the temperature
+    `T`."""
 
     friction: Any
     temperature: Value

@@ -2,9 +2,9 @@
 
 - `checks`: whether a system has the structure that a solver needs, by tracing what its
   vector fields depend on.
-- `assertion`: the structure that a user asserted, against derivatives at one state.
-- `commuting`: whether noises commute, at random states.
-- `said_twice`: one Hamiltonian in two drifts, one Brownian motion in two places.
+- `assertion`: the structure that a user asserted, compared with derivatives at one state.
+- `commuting`: whether noises commute, tested at random states.
+- `said_twice`: one Hamiltonian in two drifts, one Brownian motion in two noises.
 - `truncation`: which Gaussian increments an implicit step needs bounded.
 """
 

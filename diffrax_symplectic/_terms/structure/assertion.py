@@ -1,5 +1,5 @@
-"""Structures that a user asserts, compared with values of the terms at the start and near
-it."""
+"""Structures that a user asserts, compared with derivatives of the terms at the start and
+near it."""
 
 import diffrax
 import equinox as eqx
@@ -17,12 +17,12 @@ from ..drift_and_noise import control_struct
 from ..symplectic_gradients import AssertedStructure
 
 
-# The number of random directions of the state and of the control. Along one of them a
-# derivative that is not zero vanishes with probability zero; the others are there for
-# rounding errors.
+# The number of random directions of the state and of the control. A derivative that is not
+# zero vanishes along a random direction with probability zero, but it may be as small as
+# rounding errors. Hence several directions.
 _NUM_DIRECTIONS = 4
-# The terms are looked at once more at this distance from the start, relative to the largest
-# number of the state: at an extremum a forbidden derivative is zero.
+# Derivatives are also taken at this distance from the start, relative to the largest number
+# of the state, since a forbidden derivative may vanish at the start alone.
 _RELATIVE_DISTANCE = 1e-3
 
 
@@ -37,19 +37,19 @@ def contradicts_assertion(
     """Whether derivatives of a term at the state `y0`, or near it, contradict its asserted
     structure.
 
-    A contradiction is a proof, since rounding errors are far smaller than what counts. The
-    converse does not hold: the structure may be violated at other states. `False` if any
-    value is traced, as in every program of a solve.
+    If true, the assertion is wrong: rounding errors are far smaller than what counts as a
+    contradiction. If false, the term may have another structure at other states. Always
+    false if any value is traced, as in every program of a solve.
     """
     if any(map(is_traced, jtu.tree_leaves((term, t0, y0, args)))):
         return False
     t0 = jnp.asarray(t0, jnp.result_type(float))
     y0 = jtu.tree_map(jnp.asarray, y0)
-    # One program, also where the user debugs under `jax.disable_jit()`: operation by
+    # Always compiled, even if the user debugs under `jax.disable_jit()`: operation by
     # operation this would be slow.
     with jax.disable_jit(False):
         is_broken = _breaks_structure(term, structure, is_noise, t0, y0, args)
-    # Under `jax.jit` of the user's the result is traced, even for constants.
+    # Within a `jax.jit` of the user's the result is traced, even if no input is.
     return not is_traced(is_broken) and bool(is_broken)
 
 
@@ -62,29 +62,24 @@ def _breaks_structure(
     y0: Y,
     args: Args,
 ) -> Bool[Array, ""]:
-    """Whether a derivative that the structure forbids is larger than rounding errors, along
-    any of some random directions.
+    """Whether a value or derivative that the structure forbids is larger than rounding
+    errors, along any of some random directions.
 
-    With the change (dp, dq) of the state by the term, the structures forbid:
+    The change of the state by the term is (dp, dq). The structures forbid:
 
-    - additive: derivatives of dp and dq by p and q;
-    - separable, of a noise: dq itself with all its derivatives, and derivatives of dp by p;
-    - separable, of a drift: derivatives of dp by p, and of dq by q and t.
+    - "additive": derivatives of dp and dq by p and q;
+    - "separable", for noise: dq with all its derivatives, and derivatives of dp by p;
+    - "separable", for a drift: derivatives of dp by p, and of dq by q and t.
     """
     zeros, unravel = zeros_and_unravel((y0, control_struct(term, t0)))
-    # A bound, as a fraction of the largest value or derivative, between rounding errors,
-    # also of long sums, and any real mistake. Times may have more digits than the state, so
-    # the dtype of the state decides.
+    # What counts as larger than rounding errors, as a fraction of the largest value or
+    # derivative. The threshold lies above the errors of long sums, and below what a mistake
+    # gives. Its dtype is that of the state, since times may have more digits.
     eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).eps)
     threshold = eps ** (2 / 3)
 
     largest = largest_entry(y0)
     distance = _RELATIVE_DISTANCE * jnp.where(largest > 0, largest, 1)
-
-    def is_broken_along(direction: Array) -> Bool[Array, ""]:
-        dy, control = unravel(direction)
-        nearby = jtu.tree_map(lambda x, dx: x + distance * dx, y0, dy)
-        return is_broken_at(y0, dy, control) | is_broken_at(nearby, dy, control)
 
     def is_broken_at(y: Y, dy: Y, control: PyTree[Array]) -> Bool[Array, ""]:
         along_p, along_q = dy
@@ -104,14 +99,19 @@ def _breaks_structure(
         if structure == "additive":
             forbidden = [dp_by_p, dq_by_p, dp_by_q, dq_by_q]
         elif is_noise:
-            # `dq` may vanish at this state alone, so its derivatives count, too.
+            # `dq` may vanish at this state alone, so its derivatives are tested, too.
             forbidden = [dq, dq_by_p, dq_by_q, dq_by_t, dp_by_p]
         else:
             forbidden = [dp_by_p, dq_by_q, dq_by_t]
         of_p = [dp, dp_by_p, dp_by_q, dp_by_t]
         of_q = [dq, dq_by_p, dq_by_q, dq_by_t]
-        # With NaN, or infinity on both sides, this is false: such values tell nothing.
+        # False for NaN, or for infinity on both sides: then nothing is known.
         return largest_entry(forbidden) > threshold * largest_entry([of_p, of_q])
+
+    def is_broken_along(direction: Array) -> Bool[Array, ""]:
+        dy, control = unravel(direction)
+        nearby = jtu.tree_map(lambda x, dx: x + distance * dx, y0, dy)
+        return is_broken_at(y0, dy, control) | is_broken_at(nearby, dy, control)
 
     directions = jr.normal(jr.key(0), (_NUM_DIRECTIONS, zeros.size), zeros.dtype)
     return jnp.any(jax.vmap(is_broken_along)(directions))

@@ -1,5 +1,9 @@
 """Checks that a system has the structure that a family of methods needs: by tracing what
-the vector fields depend on, or by the user's assertion."""
+the vector fields depend on, or by the user's assertion.
+
+Here a Hamiltonian term is one from `hamiltonian_terms` or `langevin_terms`. A plain term is
+any other, such as a `diffrax.ODETerm` of the user's.
+"""
 
 from typing import Any, get_args, NamedTuple
 
@@ -35,7 +39,7 @@ from .assertion import contradicts_assertion
 from .said_twice import check_drifts_differ
 
 
-# What to do instead, in messages.
+# Advice in messages.
 _GENERAL = (
     "use a solver for general systems, for example `ImplicitMidpoint` or `StrangGauss`"
 )
@@ -59,16 +63,19 @@ FRICTION = (
 )
 
 
+# Terms, each with what the change of the state by the term depends on.
+_TracedTerms = list[tuple[diffrax.AbstractTerm, Dependence]]
+
+
 class Fault(NamedTuple):
     """Why a system does not have a structure.
 
     - `cause`: what is wrong, as a part of a sentence.
     - `advice`: what to do, in sentences.
-    - `friction`: whether all that is wrong is a force of plain terms that depends on the
-        momentum, such as friction; with `wrong_way_round`, all that is wrong once the
-        halves of the state are exchanged.
     - `wrong_way_round`: whether with the halves of the state exchanged nothing would be
-        wrong, or friction alone.
+        wrong, or only friction.
+    - `friction`: whether only friction is wrong, a force of plain terms that depends on the
+        momentum. If `wrong_way_round`, this is so with the halves exchanged.
     """
 
     cause: str
@@ -97,8 +104,8 @@ def check_structure(
     args: Args,
     solver_name: str,
 ) -> None:
-    """Raises a `ValueError` unless a system has the structure that a solver needs; also if
-    increments do not fit a vector field, or if two drifts are the same."""
+    """Raises a `ValueError` unless a system has the `structure` that a solver needs. Also
+    raises one if increments do not fit a vector field, or if two drifts are the same."""
     check_increments(noise, t0, y0, args)
     check_drifts_differ(drift)
     if structure not in get_args(Structure):
@@ -107,7 +114,7 @@ def check_structure(
             f"{get_args(Structure)}; got {structure!r}."
         )
 
-    def check_no_fault(needs: str, fault: Fault | None) -> None:
+    def raise_if(fault: Fault | None, needs: str) -> None:
         if fault is None:
             return
         advice = fault.advice
@@ -119,15 +126,15 @@ def check_structure(
 
     if structure in ("separable", "separable and constant"):
         check_pair(y0)
-        needs = "H0 = V(p) + U(t, q) and noise Hamiltonians H_k = U_k(t, q)"
-        check_no_fault(needs, separable_fault(drift, noise, t0, y0, args))
+        fault = separable_fault(drift, noise, t0, y0, args)
+        raise_if(fault, "H0 = V(p) + U(t, q) and noise Hamiltonians H_k = U_k(t, q)")
     # A "constant" structure is additive, and constant in time.
     if structure in ("additive", "constant", "separable and constant"):
-        needs = "additive noise, H_k = -sigma_k(t).q + gamma_k(t).p"
-        check_no_fault(needs, additive_fault(noise, t0, y0, args))
-        if structure != "additive":
-            needs = "additive noise that is constant in time"
-            check_no_fault(needs, constant_fault(noise, t0, y0, args))
+        fault = additive_fault(noise, t0, y0, args)
+        raise_if(fault, "additive noise, H_k = -sigma_k(t).q + gamma_k(t).p")
+    if structure in ("constant", "separable and constant"):
+        fault = constant_fault(noise, t0, y0, args)
+        raise_if(fault, "additive noise that is constant in time")
 
 
 def separable_fault(
@@ -137,90 +144,107 @@ def separable_fault(
     it is."""
     if advice := pair_fault(y0):
         return Fault("the state is not a pair (p, q)", advice)
-    # Friction of `langevin_terms` is taken apart from its drift, which then is one of a
-    # Hamiltonian, so that its faults are named as those of derivatives of H0.
+    # The friction of `langevin_terms` becomes a term of its own. Then the faults of the
+    # rest of the drift are those of its Hamiltonian, and messages name derivatives of H0.
     frictionless, friction = friction_apart(drift)
     if fault := _wrong_assertion("separable", frictionless, noise, t0, y0, args):
         return fault
 
-    def traced(terms: Terms) -> list[tuple[diffrax.AbstractTerm, Dependence]]:
-        """The terms whose structure the user has not asserted, each with what the change of
-        the state by it depends on."""
+    def traced(terms: Terms) -> _TracedTerms:
+        """Those terms whose structure the user has not asserted."""
         to_trace = [term for term in terms if asserted_structure(term) != "separable"]
         return [(term, _dependence(term, t0, y0, args)) for term in to_trace]
 
     traced_drift = traced((*frictionless, *friction))
     traced_noise = traced(noise)
-    beside = " besides H0" if len(traced_drift) > 1 else ""
 
     def faults_if(momenta: int) -> list[Fault]:
-        """All reasons why the system is not separable, if momenta are the half of the state
-        with this number, 0 or 1."""
-        positions = 1 - momenta
-
-        def depends(dependence: Dependence, half: int, on: str) -> bool:
-            """Whether the change of a half of the state depends on the momenta `"p"`, the
-            positions `"q"`, the time `"t"` or the `"control"`."""
-
-            def read(t: Any, y: Y, control: Any) -> PyTree:
-                inputs = dict(t=t, p=y[momenta], q=y[positions], control=control)
-                return inputs[on]
-
-            return not dependence.independent(read, lambda change: change[half])
-
-        # Which half depends on what, for `H0` and for the rates of change of plain terms.
-        rules = (
-            (momenta, "p", "dH0/dq depends on p", "dp/dt depend on p"),
-            (positions, "q", "dH0/dp depends on q", "dq/dt depend on q"),
-            (positions, "t", "dH0/dp depends on t", "dq/dt depend on t"),
-        )
-        faults = []
-        for term, dependence in traced_drift:
-            is_plain = not is_hamiltonian(term)
-            advice = _advice("separable", term)
-            for half, on, cause, of_plain in rules:
-                if not depends(dependence, half, on):
-                    continue
-                if is_plain:
-                    cause = f"a drift term{beside} makes {of_plain}"
-                # Friction in a plain term changes momenta by what depends on them.
-                by_friction = is_plain and half == momenta
-                faults.append(Fault(cause, advice, friction=by_friction))
-        for term, dependence in traced_noise:
-            # The change of q is linear in the increment, so it is zero if it does not
-            # depend on the increment.
-            may_move_q = depends(dependence, positions, "control")
-            if may_move_q and not _keeps_half(term, positions, t0, y0, args):
-                cause = "dH_k/dp is not zero"
-                of_plain = "a noise term changes q, the second half of the state"
-            elif depends(dependence, momenta, "p"):
-                cause = "dH_k/dq depends on p"
-                of_plain = "a noise term changes p by an amount that depends on p"
-            else:
-                continue
-            cause = cause if is_hamiltonian(term) else of_plain
-            faults.append(Fault(cause, _advice("separable", term)))
-        return faults
+        """All reasons why the system is not separable, if the momenta are the half of the
+        state with this number, 0 or 1."""
+        drift_faults = _drift_faults(traced_drift, momenta)
+        return drift_faults + _noise_faults(traced_noise, momenta, t0, y0, args)
 
     faults = faults_if(momenta=0)
     if len(faults) == 0:
         return None
-    faults_if_exchanged = faults_if(momenta=1)
     first = faults[0]
     by_friction = first._replace(advice=f"{FRICTION} {first.advice}", friction=True)
     if all(fault.friction for fault in faults):
         return by_friction
+    # The state may be (position, velocity), in the order of many other packages.
+    faults_if_exchanged = faults_if(momenta=1)
     if len(faults_if_exchanged) == 0:
         return first._replace(friction=False, wrong_way_round=True)
-    # The state is (position, velocity), the order of many other packages, with friction.
     if all(fault.friction for fault in faults_if_exchanged):
         return by_friction._replace(wrong_way_round=True)
     # Something other than friction is wrong in both orders.
     return first._replace(friction=False)
 
 
+def _drift_faults(traced_drift: _TracedTerms, momenta: int) -> list[Fault]:
+    """The reasons why drift terms are not those of a separable system, if the momenta are
+    the half of the state with this number, 0 or 1. A fault of `friction` is one that a
+    friction would cause."""
+    positions = 1 - momenta
+    # Each rule: the change of one half of the state must not depend on an input. Then the
+    # name of the fault in a Hamiltonian term, and in a plain term.
+    rules = (
+        (momenta, momenta, "dH0/dq depends on p", "dp/dt depend on p"),
+        (positions, positions, "dH0/dp depends on q", "dq/dt depend on q"),
+        (positions, "t", "dH0/dp depends on t", "dq/dt depend on t"),
+    )
+    beside = " besides H0" if len(traced_drift) > 1 else ""
+    faults = []
+    for term, dependence in traced_drift:
+        is_plain = not is_hamiltonian(term)
+        advice = _advice("separable", term)
+        for half, on, cause, cause_if_plain in rules:
+            if not _depends(dependence, half, on):
+                continue
+            if is_plain:
+                cause = f"a drift term{beside} makes {cause_if_plain}"
+            by_friction = is_plain and half == momenta
+            faults.append(Fault(cause, advice, friction=by_friction))
+    return faults
+
+
+def _noise_faults(
+    traced_noise: _TracedTerms, momenta: int, t0: RealScalarLike, y0: Y, args: Args
+) -> list[Fault]:
+    """The reasons why noise terms are not those of a separable system, if the momenta are
+    the half of the state with this number, 0 or 1."""
+    positions = 1 - momenta
+    faults = []
+    for term, dependence in traced_noise:
+        # The change of q is linear in the increment. So it is zero if it does not depend on
+        # the increment.
+        may_move_q = _depends(dependence, positions, on="control")
+        if may_move_q and not _keeps_half(term, positions, t0, y0, args):
+            cause = "dH_k/dp is not zero"
+            cause_if_plain = "a noise term changes q, the second half of the state"
+        elif _depends(dependence, momenta, on=momenta):
+            cause = "dH_k/dq depends on p"
+            cause_if_plain = "a noise term changes p by an amount that depends on p"
+        else:
+            continue
+        cause = cause if is_hamiltonian(term) else cause_if_plain
+        faults.append(Fault(cause, _advice("separable", term)))
+    return faults
+
+
+def _depends(dependence: Dependence, half: int, on: int | str) -> bool:
+    """Whether the change of one half of the state, 0 or 1, depends on an input: on a half
+    of the state, 0 or 1, on the time `"t"`, or on the `"control"`."""
+
+    def read(t: Any, y: Y, control: Any) -> PyTree:
+        return {0: y[0], 1: y[1], "t": t, "control": control}[on]
+
+    return not dependence.independent(read, lambda change: change[half])
+
+
 def additive_fault(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> Fault | None:
-    """Why the noise is not additive; `None` if it does not depend on the state."""
+    """Why the noise is not additive; `None` if it is additive: if it does not depend on the
+    state."""
     if fault := _wrong_assertion("additive", (), noise, t0, y0, args):
         return fault
     for term in noise:
@@ -245,7 +269,7 @@ def check_assertions(
     terms: diffrax.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args
 ) -> None:
     """Raises a `ValueError` if the values at `y0` contradict a `structure` that the user
-    asserted. Programs of a solve, in which values are traced, cannot tell."""
+    asserted. Raises nothing if the values are traced, as in the program of a solve."""
     drift, _, noise = split_friction(without_constraint(terms))
     # Only noise can break an additive structure.
     drifts = {"separable": drift, "additive": ()}
@@ -267,9 +291,13 @@ def check_stratonovich(
     all_terms: bool = False,
 ) -> None:
     """Raises a `ValueError` if an Ito solver gets noise that is meant in the sense of
-    Stratonovich, where the two senses differ. Noise of Hamiltonians is meant so, and with
-    `all_terms`, as in `expectation`, all noise. The senses agree for additive noise, and
-    for noise that changes only `p` and depends only on `q`."""
+    Stratonovich, and the two senses differ.
+
+    - The noise of Hamiltonians is meant in the sense of Stratonovich. With `all_terms`, as
+        in `expectation`, all noise is.
+    - The two senses agree for additive noise, and for noise that changes only `p` and
+        depends only on `q`.
+    """
     if not isinstance(solver, diffrax.AbstractItoSolver):
         return
     drift, noise = split_terms(terms)
@@ -277,7 +305,7 @@ def check_stratonovich(
         whose = "`expectation` takes all terms"
         instead = ", or use `monte_carlo`"
     else:
-        # A drift beside `H0` may be the correction from one sense to the other.
+        # A plain drift term may be the correction from one sense to the other.
         if not all(map(is_hamiltonian, drift)):
             return
         noise = tuple(filter(is_hamiltonian, noise))
@@ -295,7 +323,7 @@ def check_stratonovich(
 def _dependence(
     term: diffrax.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args
 ) -> Dependence:
-    """The dependence of the change of the state by a term on time, state and control."""
+    """What the change of the state by a term depends on, of time, state and control."""
     t0 = jnp.asarray(t0, jnp.result_type(float))
 
     def change_of_state(t: RealScalarLike, y: Y, control: Any) -> Y:
@@ -307,16 +335,16 @@ def _dependence(
 def _keeps_half(
     term: diffrax.AbstractTerm, half: int, t0: RealScalarLike, y0: Y, args: Args
 ) -> bool:
-    """Whether a plain noise term leaves one half of the state unchanged because its matrix
-    has a block of zeros that is known while tracing."""
-    # A noise Hamiltonian that does not depend on a half of the state has the gradient zero
-    # by that half, which tracing has seen.
+    """Whether a plain noise term is known, while tracing, to leave one half of the state
+    unchanged. Then its matrix has zeros in the rows of this half.
+
+    Always false for Hamiltonian terms: what does not depend on one half of the state has no
+    derivative by it, so that `_dependence` shows that the other half does not change."""
     if is_hamiltonian(term):
         return False
-    struct = control_struct(term, t0)
-    # Under `jit` the entries of a known matrix would be traced.
+    # Outside of this context the entries of a known matrix would be traced under `jit`.
     with at_trace_time():
-        zeros, unravel = zeros_and_unravel(struct)
+        zeros, unravel = zeros_and_unravel(control_struct(term, t0))
         # One noise at a time.
         changes = [
             unwrapped(term).vf_prod(t0, y0, args, unravel(unit))[half]
@@ -334,9 +362,9 @@ def _wrong_assertion(
     y0: Y,
     args: Args,
 ) -> Fault | None:
-    """The fault of the first term that the user asserted to have this structure, and that
-    does not have it at `y0`; `None` if there is none, or if values are traced. For
-    "additive" pass no drift: only noise can break it."""
+    """The fault of the first term that the user asserted to have this structure, but that
+    does not have it at or near `y0`; `None` if no term is wrong, or if values are traced.
+    For "additive" pass no drift: only noise can break this structure."""
     for i, term in enumerate((*drift, *noise)):
         is_noise = i >= len(drift)
         if asserted_structure(term) != structure:
@@ -358,18 +386,8 @@ def _wrong_assertion(
 
 
 def _advice(structure: AssertedStructure, term: diffrax.AbstractTerm) -> str:
-    """How to write a term with this structure so that tracing shows it."""
-    form = {
-        "separable": "H0 as a sum `V(p) + U(t, q)`, each summand of p or q alone",
-        "additive": "each H_k as a function linear in p and q, such as `-sigma * q`",
-    }[structure]
-    maker_name = name_of_maker(term)
-    # The structure of plain terms, and of the noise of a bath, cannot be asserted.
-    if maker_name is None:
-        assertion = ""
-    else:
-        assertion = f', or pass `structure="{structure}"` to `{maker_name}`'
-    general = _GENERAL_BATH if maker_name == "langevin_terms" else _GENERAL
+    """How to write a term so that tracing shows this structure, and what to do if it does
+    not have it."""
     is_drift = len(brownian_paths(term)) == 0
     if is_drift and not is_hamiltonian(term):
         return (
@@ -377,6 +395,17 @@ def _advice(structure: AssertedStructure, term: diffrax.AbstractTerm) -> str:
             "`jnp.zeros_like(q)`. `ImplicitMidpoint` takes such a term, and so does "
             "`BAOAB(ImplicitMidpoint())` beside the friction of `langevin_terms`."
         )
+    form = {
+        "separable": "H0 as a sum `V(p) + U(t, q)`, each summand of p or q alone",
+        "additive": "each H_k as a function linear in p and q, such as `-sigma * q`",
+    }[structure]
+    maker_name = name_of_maker(term)
+    # The structure of plain noise, and of the noise of a bath, cannot be asserted.
+    if maker_name is None:
+        assertion = ""
+    else:
+        assertion = f', or pass `structure="{structure}"` to `{maker_name}`'
+    general = _GENERAL_BATH if maker_name == "langevin_terms" else _GENERAL
     no_gradient = f" {_NO_GRADIENT}" if maker_name == "langevin_terms" else ""
     return (
         "Variables also count if they cancel, are multiplied by zero, are printed, or "

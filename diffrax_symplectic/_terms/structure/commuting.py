@@ -1,4 +1,4 @@
-"""Whether noises commute, by their brackets at random states."""
+"""Whether noises commute, tested by their Lie brackets at random states."""
 
 import functools as ft
 
@@ -18,20 +18,24 @@ from .assertion import largest_entry
 
 
 def noises_commute(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
-    """Whether the brackets `Db_l b_k - Db_k b_l` of all noises vanish at random states, for
-    these `t0` and `args`; false if this cannot be tested. This is not a proof.
+    """Whether the Lie brackets `Db_l b_k - Db_k b_l` of the vector fields of all noises
+    vanish at some random states, for these `t0` and `args`. This is a test and not a proof.
+    False if values are traced, or if no state can be tested.
 
-    The bracket is bilinear, so it is tested for two random combinations of the noises.
+    The bracket is bilinear. So a single bracket, of two random linear combinations of the
+    noises, tests all pairs of noises.
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
-    struct = [control_struct(term, t0) for term in noise]
-    zeros, unravel = zeros_and_unravel((jtu.tree_map(jnp.asarray, y0), struct, struct))
+    # A point: a state, and the coefficients of two linear combinations of the noises.
+    coefficients = [control_struct(term, t0) for term in noise]
+    point_struct = (jtu.tree_map(jnp.asarray, y0), coefficients, coefficients)
+    zeros, unravel = zeros_and_unravel(point_struct)
 
     @eqx.filter_jit
     @jax.vmap
     def sizes(point: Float[Array, " n"]) -> tuple[Array, Array]:
-        """The sizes of `Db_z b_x` and of the bracket `Db_z b_x - Db_x b_z`, at a state `y`
-        and for the combinations `x` and `z` of the noises, which are parts of `point`."""
+        """The sizes of `Db_z b_x` and of the bracket `Db_z b_x - Db_x b_z`, where `b_x` and
+        `b_z` are the linear combinations with the coefficients `x` and `z`."""
         y, x, z = unravel(point)
         b_x = ft.partial(apply, noise, x, args, t0)
         b_z = ft.partial(apply, noise, z, args, t0)
@@ -39,26 +43,27 @@ def noises_commute(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
         _, Db_x_b_z = jax.jvp(b_x, (y,), (b_z(y),))
         return largest_entry(Db_z_b_x), largest_entry((Db_z_b_x**ω - Db_x_b_z**ω).ω)
 
-    # Four with entries of either sign, and four with entries between 0 and 1, where most
-    # functions are defined.
+    # Half of the points have entries of either sign. The others have entries between 0 and
+    # 1, since roots and logarithms are not defined for negative numbers.
     shape = (4, zeros.size)
     of_either_sign = jr.normal(jr.key(0), shape, zeros.dtype)
     positive = jr.uniform(jr.key(0), shape, zeros.dtype)
     points = jnp.concatenate([of_either_sign, positive])
     try:
+        # Always compiled, even if the user debugs under `jax.disable_jit()`: operation by
+        # operation this would be slow.
         with jax.disable_jit(False):
-            # For each point the size of a summand of the bracket, and of the bracket.
-            of_summand, of_bracket = sizes(points)
-            # Points at which these are not finite tell nothing; one other has to remain.
-            is_finite = jnp.isfinite(of_summand) & jnp.isfinite(of_bracket)
-            # A bracket that cancels leaves rounding errors of its summands.
-            eps = jnp.finfo(of_summand.dtype).eps
-            is_small = of_bracket <= 1e3 * eps * of_summand
-            commute = jax.block_until_ready(
-                jnp.any(is_finite) & jnp.all(is_small | ~is_finite)
-            )
+            size_of_summand, size_of_bracket = sizes(points)
+            # Points at which the sizes are not finite do not count.
+            counts = jnp.isfinite(size_of_summand) & jnp.isfinite(size_of_bracket)
+            # A bracket that is zero is computed as a rounding error of its summands.
+            eps = jnp.finfo(size_of_summand.dtype).eps
+            is_zero = size_of_bracket <= 1e3 * eps * size_of_summand
+            commute = jnp.any(counts) & jnp.all(is_zero | ~counts)
+            # An error while the program runs is raised here at the latest.
+            commute = jax.block_until_ready(commute)
     except RuntimeError:
         # A user's `equinox.error_if` may fail at states that the user did not choose.
         return False
-    # Inside `jax.jit` the result is not known.
+    # Within a `jax.jit` of the user's the result is traced.
     return not is_traced(commute) and bool(commute)

@@ -1,4 +1,5 @@
-"""Terms that say something twice: one drift that counts double, one noise in two places."""
+"""Terms that say something twice: one Hamiltonian in two drifts, or one Brownian motion in
+a bath and in another noise."""
 
 from typing import Any
 
@@ -25,15 +26,15 @@ def check_drifts_differ(terms: PyTree[diffrax.AbstractTerm]) -> None:
     earlier: list[Any] = []
     for part in hamiltonian_parts(terms):
         H0 = part.H0 if isinstance(part, Drift) else None
-        # A drift may be a slow potential alone.
+        # A noise has no `H0`, and a drift may be only a slow potential.
         if H0 is None:
             continue
-        # Functions that were traced already are compared by what they compute, which two
-        # different functions may have in common. So they are not compared here.
+        # Traced functions are equal if they compute the same, even if the user wrote two
+        # functions. So they are not compared.
         if parts_of(Traced, H0):
             continue
-        # The result is not `True` but traced for Modules with traced parameters, which may
-        # be equal or not.
+        # For Modules with traced parameters, which may be equal or not, the result of
+        # `tree_equal` is traced, and so it is not `True`.
         if any(eqx.tree_equal(H0, other) is True for other in earlier):
             # The name of a function, or of the class of a Module.
             name = getattr(H0, "__name__", type(H0).__name__)
@@ -48,9 +49,9 @@ def check_drifts_differ(terms: PyTree[diffrax.AbstractTerm]) -> None:
 
 
 def check_baths_have_own_noise(terms: PyTree[diffrax.AbstractTerm]) -> None:
-    """Raises a `ValueError` if a bath shares a random key with another term: with one
-    Brownian motion for both, the temperature would be wrong. Traced keys are not compared,
-    since their values are not known."""
+    """Raises a `ValueError` if a bath shares a random key with another term. One Brownian
+    motion would drive both, and the temperature would be wrong. Traced keys, whose values
+    are not known, are not compared."""
     noise = [term for term in flattened(terms) if len(brownian_paths(term)) > 0]
     keys_of_each = [_known_keys(term) for term in noise]
     for i, term in enumerate(noise):
@@ -67,7 +68,8 @@ def check_baths_have_own_noise(terms: PyTree[diffrax.AbstractTerm]) -> None:
 
 
 def _known_keys(term: diffrax.AbstractTerm) -> set[bytes]:
-    """The random keys of the paths of a term that are not traced, each as its words."""
+    """The random keys of the paths of a term, each as the bytes of its data. Traced keys
+    are left out."""
     keys = filter(is_key, jtu.tree_leaves(brownian_paths(term)))
-    words_of_each = [jr.key_data(typed_key(key)) for key in keys]
-    return {np.asarray(x).tobytes() for x in words_of_each if not is_traced(x)}
+    data_of_keys = [jr.key_data(typed_key(key)) for key in keys]
+    return {np.asarray(x).tobytes() for x in data_of_keys if not is_traced(x)}

@@ -1,4 +1,9 @@
-"""Where Gaussian increments have to be truncated, and how much of them that takes away."""
+"""Truncated Gaussian increments for implicit steps: which paths need them, and terms with
+them.
+
+The equations of an implicit step may have no solution for a large increment. So Gaussian
+increments are truncated to a bounded range.
+"""
 
 from collections.abc import Sequence
 
@@ -20,20 +25,24 @@ def which_need_truncation(
     terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: Y, args: Args
 ) -> tuple[bool, ...]:
     """For each Brownian path of the terms, whether implicit steps need its increments
-    bounded: whether noise that it drives depends on the state.
+    truncated: whether a noise that it drives depends on the state.
 
-    Additive noise enters the equations of the stages as a constant, which any increment
-    may be. So does the noise of a bath with constant friction. If friction depends on
-    positions, an increment acts on it only through the positions, to which the momenta
-    carry it with the small factor h. So no bound is needed, and one would cool the bath."""
+    Additive noise enters the equations of the stages as a constant, of any size, and needs
+    no truncation.
+
+    The noise of a bath needs none either, and truncation would cool the bath. With constant
+    friction the noise is additive. With friction that depends on positions, an increment
+    acts on the friction only through the positions, which it changes with the small factor
+    h."""
     noise = [term for term in flattened(terms) if len(brownian_paths(term)) > 0]
-    # One flag for each path, in the order of `brownian_paths(terms)`.
+    # For each path whether its own term depends on the state, in the order of
+    # `brownian_paths(terms)`.
     depends_on_state = []
     for term in noise:
         is_bath = isinstance(unwrapped(term), BathNoise)
         depends = not is_bath and _depends_on_state(term, t0, y0, args)
         depends_on_state += [depends] * len(brownian_paths(term))
-    # Equal paths are one Brownian motion, which has one law.
+    # Equal paths are one Brownian motion. They are all truncated if any of them is.
     numbers = motion_numbers(brownian_paths(terms))
     flags = zip(numbers, depends_on_state)
     truncated_numbers = {number for number, depends in flags if depends}
@@ -44,6 +53,7 @@ def which_need_truncation(
 def _depends_on_state(
     term: diffrax.AbstractTerm, t0: RealScalarLike, y0: Y, args: Args
 ) -> bool:
+    """Whether the vector field of a noise term depends on the state."""
     return additive_fault((term,), t0, y0, args) is not None
 
 
@@ -53,7 +63,7 @@ def with_truncation(
     unit: Float[np.ndarray, ""] | None = None,
 ) -> PyTree[diffrax.AbstractTerm]:
     """The terms with a `TruncatedBrownianPath`, of this `unit` of time, in place of each
-    path whose flag in `which` is true, if its increments are Gaussian without Lévy areas.
+    `FixedStepBrownianPath` whose flag in `which` is true and that has no Lévy areas.
     `which` has a flag for each Brownian path of the terms, in order."""
     remaining_flags = iter(which)
 
