@@ -9,11 +9,11 @@ Solvers, each with its `record`:
 What they are made of:
 
 - `base`: the base classes, and the step of a tableau; `record`: facts about a solver.
-- `driven`, `brackets`: what drives the stages of a step.
+- `driven`, `brackets`: the changes of the state by drift and noise over a step.
 - `step`: a step by the plan of a tableau, and its stage equations.
-- `pieces`: those of a splitting; `flow`, `linear_flow`: flows there; `bath`: friction and
-  noise.
-- `constrained`: steps of systems with a constraint.
+- `pieces`: the pieces of a splitting; `flow`, `linear_flow`: flows as pieces; `bath`:
+  friction and noise as a piece.
+- `constrained`: start and end of a step under a constraint.
 - `paths`: the path that a solver needs; `times`: whether times resolve a step.
 """
 

@@ -85,24 +85,22 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     @property
     def tableau(self) -> AdditiveTableau:
-        beta1 = self.beta1
-        beta2 = self.beta2
-        # The stages contain I_k0 / h times these factors in place of the path. I_k0 / h has
-        # the variance h / 3, and the path, in the mean over the step, h / 2. So the mean of
-        # the squared factors over both stages is 3 / 2.
+        # In the stages, I_k0 / h times one of these factors replaces the Brownian motion.
+        # I_k0 / h has the variance h / 3. Brownian motion has the variance h / 2 in the
+        # mean over the step. So the mean of both squared factors is 3 / 2.
         first_factor = 1 + self.sign / np.sqrt(2)
         second_factor = 1 - self.sign / np.sqrt(2)
         # The coefficients of I_k and I_k0 / h in the formulas above.
         B_of_I_k0 = np.array([[first_factor, 0], [second_factor - self.b, self.b]])
-        beta_of_I_k = np.array([beta1, 1 - beta1])
-        beta_of_I_k0 = np.array([beta2, -beta2])
+        beta_of_I_k = np.array([self.beta1, 1 - self.beta1])
+        beta_of_I_k0 = np.array([self.beta2, -self.beta2])
         # In Diffrax's variables, I_k = W and I_k0 / h = W / 2 + H.
         return AdditiveTableau(
             alpha=[1 / 2, 1 / 2],
             beta={"W": beta_of_I_k + beta_of_I_k0 / 2, "H": beta_of_I_k0},
             A=[[1 / 4, 0], [1 / 2, 1 / 4]],
             B={"W": B_of_I_k0 / 2, "H": B_of_I_k0},
-            c1=[1 + (beta1 - 1) / beta2, 1 + beta1 / beta2],
+            c1=[1 + (self.beta1 - 1) / self.beta2, 1 + self.beta1 / self.beta2],
         )
 
 

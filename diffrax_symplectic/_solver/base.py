@@ -35,14 +35,15 @@ from .times import result_with_times_checked
 
 
 if TYPE_CHECKING:
-    # In one module for all, Pyright would take the variables for arguments of `__init__`.
+    # Repeated in each module that needs it: if the name came from another module of this
+    # package, Pyright would take abstract variables for arguments of `__init__`.
     from typing import ClassVar as AbstractVar
 else:
     from equinox import AbstractVar
 
 
-# The solver state is an `Outcome`: whether all stage equations were solved so far. Diffrax
-# continues to step a failed path while others of its batch go on.
+# The solver state is an `Outcome`, by which a step knows the paths that failed before:
+# Diffrax continues to step them while others of their batch go on.
 class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
     r"""The base class of all solvers of this package, and of your own solvers that are not
     Runge--Kutta methods.
@@ -64,7 +65,7 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
         diffrax.LocalLinearInterpolation
     )
     record: ClassVar[Record | None] = None
-    # Whether it takes constrained terms.
+    # Whether the solver takes constrained terms.
     keeps_constraints: ClassVar[bool] = False
     structure: AbstractVar[Structure]
     variables: AbstractVar[tuple[str, ...]]
@@ -76,13 +77,14 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
 
     @property
     def undoes_its_steps(self) -> bool:
-        """Whether a step with negated increments leads back to where a step began, which
-        [`diffrax_symplectic.ReversingAdjoint`][] needs."""
+        """Whether a step back in time, with negated increments, returns to where the step
+        began. [`diffrax_symplectic.ReversingAdjoint`][] needs this."""
         return False
 
     @property
     def minimal_levy_area(self) -> type[diffrax.AbstractBrownianIncrement]:
-        """The least that the path's increments must contain."""
+        """The type of increment that the path must return. It determines the Lévy areas
+        that an increment contains."""
         variable = most_demanding_variable(self.variables)
         if variable is None:
             return diffrax.AbstractBrownianIncrement
@@ -105,13 +107,14 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
         # Solvers of the user's own need no record.
         if self.record is None:
             return None
-        # The terms are looked at only if it matters: for most solvers they may be `None`.
-        depends_on_commuting = isinstance(getattr(self.record, want), tuple)
-        # One noise commutes with itself, and without noise there is nothing to commute.
-        # Whether several commute depends on values, which are not known here, so the lower
-        # order is returned.
-        commute = not depends_on_commuting or number_of_noises(terms) <= 1
-        return self.record.order(want, commute)
+        if_commuting = self.record.order(want, commute=True)
+        otherwise = self.record.order(want, commute=False)
+        # Most solvers have one order for both, and accept `None` as `terms`.
+        if if_commuting == otherwise:
+            return otherwise
+        # One noise commutes with itself. Whether several commute depends on values, which
+        # are not known here.
+        return if_commuting if number_of_noises(terms) <= 1 else otherwise
 
     def path(
         self,
@@ -122,13 +125,15 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
     ) -> diffrax.AbstractBrownianPath:
         """A Brownian path for fixed steps, with the random variables that the solver needs.
 
-        The path does not know the terms. So where an implicit solver needs increments alone
-        and these are Gaussian, it is a [`diffrax_symplectic.TruncatedBrownianPath`][]: with
-        noise that depends on the state, steps with unbounded increments may have no
-        solution. It loses variance in steps that are not short in its `unit` of time, which
-        is 1. For additive noise, which needs none of this, pass a
-        [`diffrax_symplectic.FixedStepBrownianPath`][], or where a shape suffices, the
-        shape: [`diffrax_symplectic.expectation`][], [`diffrax_symplectic.ensemble`][] and
+        If an implicit solver needs Gaussian increments without Lévy areas, the path is a
+        [`diffrax_symplectic.TruncatedBrownianPath`][]: with noise that depends on the
+        state, a step with an unbounded increment may have no solution. A truncated path
+        loses variance in steps that are not short in its `unit` of time, which is 1.
+
+        Additive noise needs no truncation, but a solver without terms cannot know that the
+        noise is additive: pass a [`diffrax_symplectic.FixedStepBrownianPath`][] then. Or
+        pass the shape where it is accepted in place of a path:
+        [`diffrax_symplectic.expectation`][], [`diffrax_symplectic.ensemble`][] and
         [`diffrax_symplectic.suggest_solver`][] see what the noise depends on.
         [`diffrax_symplectic.langevin_terms`][] truncate nothing.
 
@@ -146,10 +151,8 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
         if want not in ("strong", "weak", None):
             raise ValueError(f'`want` must be "strong" or "weak"; got {want!r}.')
         if want is None:
-            has_strong_order = (
-                self.record is not None and self.record.strong is not None
-            )
-            want = "strong" if has_strong_order else "weak"
+            strong_order = None if self.record is None else self.record.strong
+            want = "weak" if strong_order is None else "strong"
         is_implicit = isinstance(self, diffrax.AbstractImplicitSolver)
         make_path = path_maker(
             self.variables, gaussian=want == "strong", bounded=is_implicit
@@ -162,7 +165,8 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
         arguments = []
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            # `tree_equal` of traced values is a traced boolean: they count as different.
+            # For a traced value `tree_equal` is a traced boolean, which is not `True`: the
+            # value counts as different.
             is_default = eqx.tree_equal(value, field.default) is True
             if field.repr and not is_default:
                 # `tree_pformat` would ignore the `__repr__` of a module, such as this one.
@@ -210,7 +214,8 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
 
     @property
     def structure(self) -> Structure:
-        # A tableau of the user's own may lack it: `check` refuses `None` with advice.
+        # A tableau of the user's own may lack `structure`: `check` raises an error for
+        # `None`, with advice.
         return getattr(self.tableau, "structure", None)  # pyright: ignore
 
     @property
@@ -246,17 +251,18 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         del made_jump
         drift, noise = split_terms(terms)
         plan = make_plan(_without_idle_stages(self.tableau.flatten(), drift, noise))
-        # All inputs of a step are batched if any is: values that become batched within its
-        # loops would make JAX trace these again.
+        # If one input of the step is batched by `vmap`, all become so here. An input that
+        # became batched within a loop would make JAX trace the loop again.
         inputs = (t0, t1, y0, solver_state)
         begin, end, y0, solver_state = batched_like(inputs, (inputs, terms, args))
         h = end - begin
         by_drift = drift_change(drift, begin, end, args)
-        # The path gets the unbatched times: if these are the same for all paths of a batch,
-        # so is the place of the step in the path.
         names = _variables(plan.tableau)
         solver_name = type(self).__name__
+        # Brownian paths get the times as they are, `t0` and `t1`. If these are not batched,
+        # what depends on times alone is computed once for the whole batch.
         by_noise = noise_changes(by_drift, h, noise, names, t0, t1, args, solver_name)
+        # Without drift terms no stage has the channel "h".
         changes = {"h": by_drift, **by_noise} if drift else by_noise
         y1, outcome = take_step(plan, Step(begin, h, changes), y0, self, solver_state)
         result = result_with_times_checked(terms, t0, t1, result_of(outcome, y1))
@@ -266,8 +272,8 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
 def _without_idle_stages(
     tableau: FlatTableau, drift: Terms, noise: Terms
 ) -> FlatTableau:
-    """The tableau without stages that no term drives (an ODE has no noise); and if there
-    is no drift, without its brackets with the noise."""
+    """The tableau without the stages that no term drives: an ODE has no noise, and there
+    may be no drift. Without a drift, its brackets with the noise are left out, too."""
     driven_stages = []
     for i, stage in enumerate(tableau.stages):
         terms = drift if stage.channels == ("h",) else noise
@@ -286,16 +292,15 @@ def _without_idle_stages(
 def _variables(tableau: FlatTableau) -> list[str]:
     """The names of the random variables that drive the stages."""
     channels = [name for stage in tableau.stages for name in stage.channels]
-    # A dictionary keeps each name once, in the order of the stages. The order of a set
-    # would differ from run to run. "h" is the channel of the drift.
+    # A dictionary keeps each name once, in the order of the stages, while the order of a
+    # set would differ from run to run. "h" is the channel of the drift.
     return [name for name in dict.fromkeys(channels) if name != "h"]
 
 
 def _checked_root_finder(value: Any) -> Any:
     """The root finder `value`. Raises a `ValueError` for anything else, such as a class of
     root finders or a name that SciPy knows."""
-    kinds = optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver
-    if not isinstance(value, kinds):
+    if not isinstance(value, optx.AbstractRootFinder | optx.AbstractLeastSquaresSolver):
         raise ValueError(
             "`root_finder` must be an Optimistix root finder, or "
             f"`PicardNewton(rtol=...)`; got {value!r}."
@@ -304,7 +309,7 @@ def _checked_root_finder(value: Any) -> Any:
 
 
 class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
-    """A solver with implicit stages. It adds the two fields that Diffrax requires, both
+    """A solver with implicit stages. It has the two fields that Diffrax requires, both
     keyword-only: the root finder for the stage equations, and its maximum number of steps
     in each step of the solver."""
 
@@ -321,8 +326,9 @@ class AbstractImplicitStages(diffrax.AbstractImplicitSolver):
 
 
 def with_changed_stages(solver: Any, change: Callable[[Any], Any]) -> Any:
-    """The solver, with each solver in it (or itself) whose stage equations a `PicardNewton`
-    solves replaced by what `change` returns for it."""
+    """`solver` with `change(x)` in place of each solver `x` whose root finder is a
+    `PicardNewton`: in place of `solver` itself, or of a solver within it, such as the flow
+    of a splitting."""
 
     def change_if_possible(x: Any) -> Any:
         if _is_implicit(x) and isinstance(x.root_finder, PicardNewton):
@@ -333,15 +339,15 @@ def with_changed_stages(solver: Any, change: Callable[[Any], Any]) -> Any:
 
 
 def has_newton(solver: Any) -> bool:
-    """Whether Newton's method solves steps that the sweeps of a `PicardNewton` do not, in
-    the solver or one in it."""
+    """Whether `solver`, or a solver within it, has a `PicardNewton` whose sweeps are
+    followed by Newton's method where they do not converge."""
     parts = jtu.tree_leaves(solver, is_leaf=_is_implicit)
     finders = [x.root_finder for x in parts if _is_implicit(x)]
     return any(isinstance(x, PicardNewton) and x.newton_steps > 0 for x in finders)
 
 
 def without_newton(solver: Any) -> Any:
-    """The solver, and all solvers in it, with a root finder that ends after its sweeps."""
+    """The solver, with each `PicardNewton` in it ending after its sweeps."""
 
     def with_sweeps_alone(implicit_solver: Any) -> Any:
         sweeps = dataclasses.replace(implicit_solver.root_finder, newton_steps=0)
@@ -354,8 +360,8 @@ def _is_implicit(x: Any) -> bool:
     return isinstance(x, AbstractImplicitStages)
 
 
-# Equinox makes an `__init__` for each class, without a docstring. This is that of solvers
-# with implicit stages.
+# Equinox makes an `__init__` for each class, without a docstring. This is the docstring for
+# solvers with implicit stages.
 IMPLICIT_ARGUMENTS = """**Arguments:** the parameters above, if any (Python numbers or
 strings), and
 
@@ -380,7 +386,7 @@ def real_number(name: str, value: Any) -> float:
     """`value` as a float. Raises a `ValueError`, which quotes the `name` of the parameter,
     unless it is a finite real number."""
     try:
-        # NumPy's `complex128` is a `complex`, of which `float` would only warn.
+        # `float` accepts NumPy's `complex128`, which is a `complex`, with a mere warning.
         number = math.nan if isinstance(value, complex) else float(value)
     except (TypeError, ValueError):
         # JAX's errors about traced arrays are of these types, too.

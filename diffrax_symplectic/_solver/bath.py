@@ -24,10 +24,10 @@ from .._terms import (
 )
 
 
-# For up to this many momenta, friction by a matrix is one linear solve in each step, which
-# the fused engine replays, too. For more, where that engine takes no matrices, a constant
-# matrix is diagonalized once for all steps. With 64 momenta that takes 4 ms, and a step of
-# `BAOAB` then 3.6 us in place of 22, or 1.5 us in place of 18 in a batch of 64 paths.
+# For up to this many momenta, friction by a matrix is one linear solve in each step. (The
+# fused engine takes matrices up to this size, too.) For more, a constant matrix is
+# diagonalized once for all steps. With 64 momenta that takes 4 ms, and then a step of
+# `BAOAB` 3.6 us in place of 22, or 1.5 us in place of 18 in a batch of 64 paths.
 _MAX_SOLVED_IN_EACH_STEP = 16
 
 
@@ -40,8 +40,8 @@ def check_friction(
     solver_name: str,
 ) -> None:
     """Raises a `ValueError` unless there is friction that is linear in the momenta, and a
-    drift beside it. `solver_name` is for messages. Shapes and dependence decide it, not
-    values, so it works under `jit`."""
+    drift beside it. `solver_name` is for messages. The check reads shapes, and what depends
+    on what, but no values, so it works under `jit`."""
     if has_lifted(drift):
         raise ValueError(
             f"`{solver_name}` applies friction to a canonical momentum, which the state "
@@ -73,8 +73,8 @@ def check_friction(
         return derivative
 
     # A function is linear, up to a constant, if its derivative is the same everywhere. The
-    # friction is G(t, q) times the velocities dH0/dp, so only these can be nonlinear in p.
-    # The second `p` stands for the change, which has its shapes; values are not read.
+    # friction is G(t, q) times the velocities dH0/dp, so only the velocities can be
+    # nonlinear in p. The second `p` stands for the change: only its shapes are read.
     dependence = Dependence(slope, p, p)
     if not dependence.independent(lambda p, change: p):
         raise ValueError(
@@ -102,11 +102,12 @@ def after_friction(
     args: Args,
     impulse: PyTree[Array],
 ) -> PyTree[Array]:
-    r"""The momenta after friction and noise over `h`, with the impulse $B W$ of the noise:
-    $p + x$ with $x = h F(p + x / 2) + B W$, where $F(p) = -G v(p)$ is linear in $p$.
+    r"""The momenta $p + x$ after friction and noise over the time `h`, by the implicit
+    midpoint rule: $x = h F(p + x / 2) + B W$, with the friction $F(p) = -G v(p)$, which is
+    linear in $p$, and the `impulse` $B W$ of the noise.
 
     This keeps the Maxwell distribution $\mathcal N(0, T M)$ for all $h$, $M$ and $G = B
-    B^\top / (2 T)$. With the increment $x$ as unknown, rounding errors are those of a small
+    B^\top / (2 T)$. With the change $x$ as unknown, rounding errors are those of a small
     number, and a friction between particles conserves their total momentum.
     """
     p, q = y
@@ -115,11 +116,11 @@ def after_friction(
         friction_force, _ = rate(friction, t, (p, q), args)
         return friction_force
 
-    # F(p + x / 2) = F(p) + S x / 2 with the slope S of F, so that
+    # F(p + x / 2) = F(p) + S x / 2, where S is the slope of F. So the equation for x is
     # (1 - h S / 2) x = h F(p) + B W.
     if acts_elementwise(force, p):
-        # Each momentum has an equation of its own, and each force one slope, so that the
-        # derivative along ones is all of them.
+        # Each force depends on its own momentum alone. So S is diagonal, and the derivative
+        # along ones is its diagonal.
         ones = jtu.tree_map(jnp.ones_like, p)
         forces, slopes = jax.jvp(force, (p,), (ones,))
 
@@ -138,23 +139,24 @@ def after_friction(
     slope = jax.jacfwd(flat_force)(flat_p)
     rhs = step_size * flat_force(flat_p) + flat_impulse
     matrix = jnp.eye(flat_p.size, dtype=flat_p.dtype) - step_size / 2 * slope
-    matrices = None
+    # Elimination in XLA operations takes a tenth of LAPACK's time for small matrices.
+    solve = eliminate if flat_p.size <= MAX_WRITTEN_OUT else jnp.linalg.solve
     if flat_p.size > _MAX_SOLVED_IN_EACH_STEP:
         matrices = _matrices_if_constant(friction, t, y, args)
-    if matrices is not None:
-        return unravel(flat_p + _solve_by_modes(*matrices, step_size, matrix, rhs))
-    # Elimination in XLA operations takes a tenth of LAPACK's time for matrices this small.
-    solve = eliminate if flat_p.size <= MAX_WRITTEN_OUT else jnp.linalg.solve
+        if matrices is not None:
+            solve = ft.partial(_solve_by_modes, *matrices, step_size)
     return unravel(flat_p + solve(matrix, rhs))
 
 
 def _matrices_if_constant(
     friction: Terms, t: RealScalarLike, y: Y, args: Args
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]] | None:
-    """The friction on velocities, G, and the inverse masses M^-1, the derivative of the
-    velocities by the momenta, for momenta as a vector; `None` unless they are known to be
-    the same at all times, momenta and positions. In a solve backward in time the inverse
-    masses have the other sign, as friction has."""
+    """The matrices G and M^-1 for momenta as a vector, or `None` unless they are known to
+    be the same at all times, momenta and positions.
+
+    G is the friction on velocities. The inverse masses M^-1 are the derivative of the
+    velocities by the momenta. In a solve backward in time they are negated, as friction is.
+    """
     if len(friction) != 1:
         return None
     field = field_of(friction[0])
@@ -170,8 +172,8 @@ def _matrices_if_constant(
         def velocity(flat_p: Array) -> Array:
             return jfu.ravel_pytree(field.velocity(t, (unravel(flat_p), q), args))[0]
 
-        # The force is -G v, linear in v: its derivative is the same at every argument, of
-        # which `flat_p` has the right shape.
+        # The force is -G v. It is linear in v, so its derivative is the same at every
+        # vector of the right shape, such as `flat_p`.
         minus_G = jax.jacfwd(force)(flat_p)
         return -minus_G, jax.jacfwd(velocity)(flat_p)
 
@@ -206,9 +208,6 @@ def _solve_by_modes(
     stay in the loop and take forty times as long as a solve, so these solve with `matrix`.
     """
 
-    def multiply(x: Array) -> Array:
-        return matrix @ x
-
     def by_modes(rhs: Array, transposed: bool = False) -> Array:
         root = semidefinite_root(G)
         rates, vectors = jnp.linalg.eigh(root.T @ inverse_masses @ root)
@@ -228,5 +227,6 @@ def _solve_by_modes(
         by_modes_transposed = ft.partial(by_modes, transposed=True)
         return lax.platform_dependent(rhs, cpu=by_modes_transposed, default=by_matrix)
 
-    # Derivatives are taken of the equation. Those of eigenvectors may be infinite.
+    # This takes derivatives of the equation. Derivatives of eigenvectors may be infinite.
+    multiply = ft.partial(jnp.matmul, matrix)
     return lax.custom_linear_solve(multiply, rhs, solve, solve_transposed)

@@ -82,11 +82,14 @@ class StrangGauss(AbstractSymplecticRungeKutta, AbstractImplicitStages):
     )
 
 
-# The flow of one vector field: two stages of the Gauss method, of order 4. Its channel is
-# called "h" whatever drives it, the drift or one noise.
+# The flow of one vector field: two stages of the Gauss method, of order 4. Their channel is
+# called "h" whatever drives them, the drift or one noise.
 _FLOW = make_plan(
     FlatTableau(
-        stages=tuple(Stage(("h",), c, "y", "y") for c in GAUSS.sum(axis=1)),
+        stages=tuple(
+            Stage(channels=("h",), c=c, reads="y", writes="y")
+            for c in GAUSS.sum(axis=1)
+        ),
         matrix=GAUSS,
         weights=_HALVES,
     )
@@ -138,7 +141,8 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
 
     @property
     def undoes_its_steps(self):
-        # With negated increments it takes its flows in reverse order.
+        # With negated increments a step takes its flows in reverse order: the coin is
+        # negated, too.
         return True
 
     def order(self, terms):
@@ -154,41 +158,42 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del made_jump
         drift, noise = split_terms(terms)
-        # A step has no state if it is called by itself, or by `diffrax.HalfSolver`.
+        # There is no state if the step is called by itself, or by `diffrax.HalfSolver`.
         outcome = no_failure() if solver_state is None else solver_state
         indices, increments = self._noises_in_order(terms, t0, t1)
-        # The drift moves to the middle of the step first, and from there to its end last.
-        # The noises between stay at the middle. Padding adds both drifts, which ignore the
-        # index and the increment of a noise.
+        # The flows, in their order: the drift moves to the middle of the step, the noises
+        # stay there, and the drift moves to the end. Padding adds the entries of the drift,
+        # which ignores the index and the increment of a noise.
         middles = [t0 + (t1 - t0) / 2] * (indices.size + 1)
         flows = (
             # Whether it is the flow of the drift, not of one noise.
             np.pad(np.full(indices.size, False), 1, constant_values=True),
-            # The times between which it moves.
+            # The times at its beginning and at its end.
             jnp.stack([t0, *middles]),
             jnp.stack([*middles, t1]),
             jnp.pad(indices, 1),
             jnp.pad(increments, 1),
         )
 
-        def after_drift(t0, t1, index, increment, y, outcome):
+        def after_drift(begin, end, index, increment, y, outcome):
             if len(drift) == 0:
                 return y, outcome
-            change = drift_change(drift, t0, t1, args)
-            step = Step(t0, t1 - t0, {"h": change})
+            change = drift_change(drift, begin, end, args)
+            step = Step(t0=begin, h=end - begin, changes={"h": change})
             return take_step(_FLOW, step, y, self, outcome)
 
-        def after_noise(t0, t1, index, increment, y, outcome):
+        def after_noise(begin, end, index, increment, y, outcome):
             if len(noise) == 0:
                 return y, outcome
             change = jtu.Partial(apply_one, noise, index, increment, args)
-            # A step of size zero: time stands still, and `change` has the increment in it.
-            step = Step(t0, jnp.zeros_like(t0), {"h": change})
+            # Time stands still, so the size of the step is zero. `change` already contains
+            # the increment.
+            step = Step(t0=begin, h=jnp.zeros_like(begin), changes={"h": change})
             return take_step(_FLOW, step, y, self, outcome)
 
         def after_flow(carry, flow):
-            is_drift, *flow = flow
-            return lax.cond(is_drift, after_drift, after_noise, *flow, *carry), None
+            is_drift, *inputs = flow
+            return lax.cond(is_drift, after_drift, after_noise, *inputs, *carry), None
 
         # A loop compiles each kind of flow only once.
         (y1, outcome), _ = lax.scan(after_flow, (y0, outcome), flows)
@@ -201,7 +206,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         if len(noise) == 0:
             return jnp.zeros(0, int), jnp.zeros(0)
         num_noises = number_of_noises(terms)
-        # A coin chooses the order of several noises.
+        # For several noises, a two-point variable is the coin that chooses their order.
         names = ["W", "two_point"] if num_noises > 1 else ["W"]
         variables = drawn_variables(noise, names, t0, t1, type(self).__name__)
         # One increment for each noise, over all terms and leaves.

@@ -81,7 +81,7 @@ def bridge_coefficients(
 def apply_bridge(
     drift: jtu.Partial,
     noise: tuple[diffrax.AbstractTerm, ...],
-    bridge_coefficients: tuple[Float[Array, " m"], Float[Array, "m m"]],
+    coefficients: tuple[Float[Array, " m"], Float[Array, "m m"]],
     h: RealScalarLike,
     args: Args,
     t: RealScalarLike,
@@ -89,21 +89,22 @@ def apply_bridge(
 ) -> Y:
     """`sum_k H_k [b_k, A] + sum_{k, l} L_kl [b_k, [b_l, A]]`, where `A(t, y) = drift(t, y)`
     is the drift times `h`, and `[b, A] = A' b - b' A`. Time is treated as a component of
-    the state that the drift advances by `h`. Computes `m` double brackets for `m` noises.
-    """
+    the state that the drift advances by `h`. The `coefficients` are `H_k` and `L_kl` of `m`
+    noises, for which `m` double brackets are computed."""
     _, unravel = zeros_and_unravel([control_struct(term) for term in noise])
     t = jnp.asarray(t, jnp.result_type(h))
-    H, _ = bridge_coefficients
+    H, _ = coefficients
 
     def b(increments: Float[Array, " m"], t: Array, y: Y) -> Y:
-        """The noise with these increments."""
+        """The change of the state by the noise with these increments."""
         pairs = zip(noise, unravel(increments))
         return tree_sum([term.vf_prod(t, y, args, control) for term, control in pairs])
 
     def bracket_and_field(
         increments: Float[Array, " m"], field: Callable, t: Array, y: Y, speed: Array
     ) -> tuple[Y, Y]:
-        """`[b, field]`, where `field` advances time by `speed`; and `field` itself."""
+        """The bracket `[b, field]` of the noise `b` with these increments, and the value of
+        `field`, a vector field that advances time by `speed`."""
         noise_value = b(increments, t, y)
         value, change_of_field = jax.jvp(lambda y: field(t, y), (y,), (noise_value,))
         b_of_increments = ft.partial(b, increments)
@@ -116,8 +117,8 @@ def apply_bridge(
         return bracket
 
     def summand(unit: Float[Array, " m"], H_k: Array, L_k: Float[Array, " m"]) -> Y:
-        """`[sum_l L_kl b_l, [b_k, A]] + H_k [b_k, A]`: by linearity one outer bracket
-        serves for all `l`."""
+        """`[sum_l L_kl b_l, [b_k, A]] + H_k [b_k, A]` for one `k`: by linearity one outer
+        bracket serves for all `l`."""
         inner = ft.partial(drift_bracket, unit)
         # The drift advances time at a constant speed, and the noise does not advance it. So
         # their bracket has no component along time.
@@ -125,7 +126,7 @@ def apply_bridge(
         return (double**ω + H_k * single**ω).ω
 
     units: Any = np.eye(H.size, dtype=H.dtype)
-    return _total(jax.vmap(summand)(units, *bridge_coefficients), len(units))
+    return _total(jax.vmap(summand)(units, *coefficients), len(units))
 
 
 def _total(summands: PyTree[Array], num_summands: int) -> PyTree[Array]:

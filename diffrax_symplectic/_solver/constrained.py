@@ -1,4 +1,4 @@
-"""Steps of constrained systems."""
+"""The start of a solve with a constraint, and the end of each of its steps."""
 
 from typing import Any
 
@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import jax.tree_util as jtu
 import optimistix as optx
 from jax import lax
-from jaxtyping import Array, Bool
+from jaxtyping import Array
 
 from .._arguments import check_pair
 from .._custom_types import Args, RealScalarLike, Y
-from .._terms import check_start, without_constraint
+from .._terms import check_start, Surface, without_constraint
 from .base import AbstractSymplecticSolver
+from .pieces import Moving
 from .step import no_failure
 
 
@@ -23,23 +24,28 @@ def init_constrained(
     y0: Y,
     args: Args,
 ) -> optx.RESULTS:
-    """Whether a path can start here, as the state of the solver. Raises a `ValueError` for
-    terms that the solver does not take, and for starts off the surface; if the start is
-    traced, so that this is not known, a path off the surface fails."""
+    """Whether a path can start at `y0`, as the state of the solver. Raises a `ValueError`
+    for terms that the solver does not take, and for a start off the surface; if `y0` is
+    traced, that is an error when run, or under `vmap` a failure of this path alone."""
     check_pair(y0)
     solver.check(without_constraint(terms), t0, y0, args)
     is_dependent, is_off = check_start(terms, t0, y0, args)
     R: Any = optx.RESULTS
     outcome = R.where(is_off, R.nonlinear_divergence, no_failure())
-    # With dependent constraints it is not known where the surface is, so this comes first.
+    # Dependent constraints come first: with them it is not known where the surface is.
     return R.where(is_dependent, R.singular, outcome)
 
 
-def end_and_outcome(
-    y1: Y, found: Bool[Array, ""], last_outcome: optx.RESULTS
+def end_on_surface(
+    moving: Moving, surface: Surface, last_outcome: optx.RESULTS
 ) -> tuple[Y, optx.RESULTS]:
-    """The end of a step, and the outcome of all steps so far, from whether the multipliers
-    of this one were `found` and the outcome before this step."""
+    """The state at the end of a constrained step, after its last piece; and the outcome of
+    all steps so far, which is a failure if multipliers were not found or a flow failed.
+    `last_outcome` is the outcome of all steps before."""
+    found = moving.found
+    for flow_result in moving.results.values():
+        found = found & (flow_result == diffrax.RESULTS.successful)
+    y1 = moving.made_tangent(surface).y
     R: Any = optx.RESULTS
     outcome = R.where(found, R.successful, R.nonlinear_max_steps_reached)
     # The first failure is the one that is reported.

@@ -1,5 +1,5 @@
-"""The changes of the state that drive the stages of a step: by the drift over its length,
-and by the vector fields of the noise times the random variables that are drawn for it."""
+"""The changes of the state by the terms over a step: by the drift, and by the vector fields
+of the noise times the random variables that are drawn for the step."""
 
 from collections.abc import Iterable
 
@@ -31,8 +31,8 @@ from .brackets import apply_brackets, apply_bridge, bridge_coefficients
 def drift_change(
     drift: Terms, t0: RealScalarLike, t1: RealScalarLike, args: Args
 ) -> jtu.Partial:
-    """The function `(t, y)` of the drift stages: the change of the state by the drift at
-    this time and state, over the whole step."""
+    """A function of `(t, y)`: the change of the state over the whole step by the drift,
+    evaluated at this time and state."""
     controls = [term.contr(t0, t1) for term in drift]
     return jtu.Partial(apply, drift, controls, args)
 
@@ -47,12 +47,12 @@ def noise_changes(
     args: Args,
     solver_name: str,
 ) -> dict[str, jtu.Partial]:
-    """The functions `(t, y)` of the noise stages, by the names of random variables: the
-    change of the state over the step of size `h` from `t0` to `t1` by the vector fields
-    that a variable multiplies. `drift` is the function of the drift stages, for variables
-    that multiply brackets with it."""
-    # Variables are attributes of an increment, but for those that multiply the brackets of
-    # the drift: they are functions of `W`, `H` and, if the increment has it, `K`.
+    """For each name of a random variable, a function of `(t, y)`: the change of the state
+    over the step from `t0` to `t1`, of size `h`, by the vector fields that the variable
+    multiplies, evaluated at this time and state. `drift` is what `drift_change` returns:
+    some variables multiply its brackets with the noise."""
+    # Most variables are attributes of an increment. The coefficients of brackets with the
+    # drift are not: they are functions of `W`, `H` and, if the increment has it, `K`.
     drawn = [name for name in names if drives(name) != "drift brackets"]
     optional = []
     if len(drawn) < len(names):
@@ -71,14 +71,15 @@ def noise_changes(
                 changes[name] = jtu.Partial(
                     apply_bridge, drift, noise, coefficients, h, args
                 )
-            case "noise brackets" if len(noise) == 1:
+            case "noise brackets":
+                if len(noise) != 1:
+                    raise ValueError(
+                        f"`{solver_name}` needs all noises in one term, whose path samples "
+                        f"the Lévy areas between them; got {len(noise)} noise terms. "
+                        "Combine them."
+                    )
                 (areas,) = values[name]
                 changes[name] = jtu.Partial(apply_brackets, noise[0], areas, args)
-            case _:
-                raise ValueError(
-                    f"`{solver_name}` needs all noises in one term, whose path samples the "
-                    f"Lévy areas between them; got {len(noise)} noise terms. Combine them."
-                )
     return changes
 
 
@@ -119,8 +120,8 @@ def drawn_variables(
     for name in [*names, *filter(all_have, optional)]:
         values = [getattr(increment, name) for increment in increments]
         if name in VARIABLES and VARIABLES[name].even:
-            # In a solve backward in time Diffrax negates all variables. Even ones must not
-            # change.
+            # In a solve backward in time Diffrax negates all variables. Even variables must
+            # keep their sign.
             pairs = zip(noise, values)
             values = [(direction(term) * value**ω).ω for term, value in pairs]
         variables[name] = values
@@ -128,15 +129,15 @@ def drawn_variables(
 
 
 def _how_to_get(missing: list[str], noise: Terms) -> str:
-    """What a solver needs for these random variables, as the end of a sentence in a
-    message: "`SRKs4` needs ..."."""
+    """The end of a message such as "`SRKs4` needs ...": the random variables that are
+    missing, and how to get them."""
     # If several are missing, the message is about the one of highest rank: a path that has
-    # it also has those of lower rank.
+    # it also has the variables of lower rank.
     variable = most_demanding_variable(missing)
     if variable is None:
         return f"increments with the attribute `{missing[0]}`"
-    # Paths of the user's own without a random key, such as recorded noise. Another path
-    # would be other noise, so that only another solver helps.
+    # A path of the user's own without a random key, such as recorded noise, cannot draw
+    # more. Another path would be other noise, so that only another solver helps.
     for path in brownian_paths(noise):
         if not is_random(path) and not isinstance(path, GivenPath):
             return (
@@ -157,9 +158,9 @@ def _with_resolution_checked(
             path = path.path
         if isinstance(path, diffrax.VirtualBrownianTree):
             tol = resolution(path)
-            # Diffrax may take a last step of a rounding error, which has next to no noise:
-            # hence the lower bound. A step of just `tol` may be rounded to less: hence the
-            # factor 0.999.
+            # The lower bound is for a last step that is as short as a rounding error, as
+            # Diffrax may take it: it has next to no noise. The factor 0.999 is for a step
+            # of `tol` that is rounded to less.
             t1 = eqx.error_if(
                 jnp.asarray(t1),
                 (step_size < 0.999 * tol) & (step_size > 1e-6 * tol),

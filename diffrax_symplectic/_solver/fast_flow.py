@@ -22,7 +22,7 @@ from .record import Order, Record
 from .splitting import AbstractLangevinSplitting
 
 
-# The end of each refusal: what to use in a heat bath.
+# The end of several error messages: what to use in a heat bath.
 _FOR_A_BATH = (
     "In a heat bath use `BAOAB(linear_flow(...))`, or `BAOAB(flow)` with a function of "
     "your own, for `langevin_terms(H0, friction, temperature, path, slow=rest)` of the "
@@ -94,8 +94,8 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
         record = self.solver.record
         if record is None:
             return None
-        # With a flow around it, stationary moments that are exact for the solver alone need
-        # not be.
+        # Stationary moments that are exact for the solver alone need not be exact with a
+        # flow around its steps.
         return record._replace(
             weak=_at_most(record.weak, self.weak),
             strong=_at_most(record.strong, self.strong),
@@ -137,7 +137,7 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
 
     def check(self, terms, t0, y0, args):
         check_pair(y0)
-        # Diffrax's own Langevin terms have friction, too.
+        # `momentum_first` finds the friction in Diffrax's own Langevin terms.
         terms, _ = momentum_first(terms, y0)
         drift, friction, _ = split_friction(terms)
         if len(friction) > 0:
@@ -176,8 +176,8 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         del made_jump
-        # The state of the solver for the rest, and whether the flow returned NaN at the
-        # start of the solve.
+        # These are the state of the solver for the rest, and whether the flow returned NaN
+        # at the start of the solve.
         inner_state, is_broken = solver_state
         # Steps are positive even in a solve backward in time, where the flow runs back.
         half = direction(terms) * (t1 - t0) / 2

@@ -1,4 +1,5 @@
-"""Flows within a splitting: another solver, or a flow that is known."""
+"""Flows within a splitting: solvers of this package, or functions that return the state
+after a time."""
 
 from collections.abc import Callable
 from typing import Any, TypeAlias
@@ -17,7 +18,7 @@ from .._root_finder import all_finite
 from .base import AbstractSymplecticSolver
 
 
-# `flow(time, y, args)`.
+# A function `flow(time, y, args)`, which returns the state after `time` from the state `y`.
 FlowFunction: TypeAlias = Callable[[RealScalarLike, Y, Args], Y]
 # A solver for systems without noise, or a function.
 Flow: TypeAlias = AbstractSymplecticSolver | FlowFunction
@@ -30,8 +31,8 @@ def is_solver(flow: Any) -> bool:
 
 
 def check_flow(flow: Any, steps: int, solver_name: str) -> None:
-    """Raises a `ValueError` unless `flow` is a flow, and for several `steps` of a flow that
-    is no solver. `solver_name` is for messages."""
+    """Raises a `ValueError` unless `flow` is a solver of this package, or a function
+    `(time, y, args)` with `steps=1`. `solver_name` is for messages."""
     if is_solver(flow):
         return
     if isinstance(flow, diffrax.AbstractSolver):
@@ -72,8 +73,8 @@ def returns_nan(
     flow: FlowFunction, time: RealScalarLike, y0: Y, args: Args
 ) -> Bool[Array, ""]:
     """Whether a flow returns NaN after `time`, half of the first step, from the start `y0`
-    of a solve. This is also an error, but not in a batch: there the path has to fail by
-    this flag, without the others."""
+    of a solve. If it does, that is an error, except under `vmap`: there the caller makes
+    this path fail, without the others of its batch."""
     # The check has no derivative.
     y1 = jtu.tree_map(lax.stop_gradient, flow(time, y0, args))
     leaf_has_nan = jnp.stack([jnp.any(jnp.isnan(x)) for x in jtu.tree_leaves(y1)])

@@ -129,10 +129,8 @@ class BAOAB(AbstractLangevinSplitting):
 
     @property
     def pieces(self) -> tuple[AbstractPiece, ...]:  # pyright: ignore
-        if self.flow is None:
-            move = _HALF_FLIGHT
-        else:
-            move = Flow(1 / 2, self.flow, self.steps)
+        flow = self.flow
+        move = _HALF_FLIGHT if flow is None else Flow(1 / 2, flow, self.steps)
         return (_HALF_KICK, move, _BATH, move, _HALF_KICK)
 
     @property

@@ -1,4 +1,5 @@
-"""The flow of a linear system, by Cayley's angles."""
+"""The flow of a linear system by Cayley's angles: in the time t a mode of frequency omega
+turns by the angle arctan(omega t), and not by omega t."""
 
 import math
 from collections.abc import Callable
@@ -98,11 +99,9 @@ def linear_flow(
     **Source:** [Korol, Rosa-Raíces, Bou-Rabee and Miller
     (2020)](https://doi.org/10.1063/1.5134810), for ring polymers.
     """
-    modes = (frequencies, to_modes, from_modes)
-    all_modes_given = all(x is not None for x in modes)
-    any_modes_given = any(x is not None for x in modes)
-    is_one_way = all_modes_given if stiffness is None else not any_modes_given
-    if not is_one_way:
+    num_given = sum(x is not None for x in (frequencies, to_modes, from_modes))
+    num_needed = 3 if stiffness is None else 0
+    if num_given != num_needed:
         raise ValueError(
             "Pass either `stiffness`, or `frequencies`, `to_modes` and `from_modes`."
         )
@@ -142,7 +141,7 @@ def _modes_of(
     n = math.prod(shape_of_q)
     K = K.reshape(n, n)
     is_known = not is_traced(K) and not is_traced(mass_roots)
-    # Both have `eigh`, `where` and so on by the same names.
+    # NumPy and `jax.numpy` have `eigh`, `where` and so on by the same names.
     xp: Any = np if is_known else jnp
     if is_known:
         largest_entry = np.max(abs(K), initial=0)
@@ -150,7 +149,7 @@ def _modes_of(
             raise ValueError(
                 "`stiffness` must be symmetric: it is a second derivative."
             )
-    # Those of all components of `q`.
+    # One root of a mass for each component of `q`.
     mass_roots_of_q = xp.broadcast_to(xp.asarray(mass_roots), shape_of_q).reshape(-1)
     # The eigenvalues are the squares of the frequencies.
     eigenvalues, vectors = xp.linalg.eigh(
@@ -184,8 +183,8 @@ class CayleyFlow(eqx.Module):
     """The flow that `linear_flow` returns.
 
     - `frequencies`: the frequencies of the modes.
-    - `to_modes`, `from_modes`: the maps between positions times the roots of masses and
-        modes.
+    - `to_modes`, `from_modes`: the maps between modes and scaled positions, which are
+        positions times the roots of the masses.
     - `mass_roots`: the roots of the masses.
     - `rest`: the positions at rest.
     """
@@ -212,9 +211,9 @@ class CayleyFlow(eqx.Module):
         rest = self.rest.astype(dtype)
         omega = self.frequencies.astype(dtype)
         time = jnp.asarray(time, dtype)
-        # The angle has the tangent `omega time`, which gives its cosine; the sine is the
-        # product of both. It is kept over the frequency: `time * cosine` has no division,
-        # and so is right for a frequency of zero, too.
+        # The tangent of the angle is `omega time`, and the sine is the product of tangent
+        # and cosine. The sine divided by omega is computed without a division, which makes
+        # it right for a frequency of zero, too.
         cosine = 1 / jnp.sqrt(1 + (omega * time) ** 2)
         sine_over_omega = time * cosine
         P = self.to_modes(p / mass_roots)

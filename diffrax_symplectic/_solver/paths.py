@@ -22,9 +22,9 @@ from .record import Want
 def own_path(
     solver: diffrax.AbstractSolver, want: Want, shape: PyTree, key: PRNGKeyArray
 ) -> diffrax.AbstractBrownianPath:
-    """The path `solver.path(shape, key)` of a solver of this package, or for any other
-    solver a Gaussian path. It is not truncated: whether it needs that depends on the terms,
-    and is seen by `which_need_truncation`."""
+    """The path `solver.path(shape, key)` of a solver of this package, or a Gaussian path
+    for any other solver. The path is not truncated: whether it must be depends on the
+    terms, and `which_need_truncation` decides it."""
     # `isinstance` would look through a `diffrax.HalfSolver`.
     if not issubclass(type(solver), AbstractSymplecticSolver):
         return common_path(solver, cell=None, shape=shape, key=key)
@@ -38,10 +38,11 @@ def common_path(
     shape: PyTree,
     key: PRNGKeyArray,
 ) -> diffrax.AbstractBrownianPath:
-    """A Gaussian path with the Lévy areas that the solver needs. With `cell`, a time of
-    which all steps are multiples, it is the same Brownian motion for all solvers. If it is
-    an array, another one compiles nothing anew, but for solvers that need Lévy areas of
-    pairs of noises."""
+    """A Gaussian path with the Lévy areas that the solver needs.
+
+    With a `cell`, a time of which all steps are multiples, the path is the same Brownian
+    motion for all solvers. If `cell` is an array, another value of it compiles nothing
+    anew, except for solvers that need Lévy areas of pairs of noises."""
     if isinstance(cell, np.ndarray):
         path = CommonBrownianPath(shape, key, cell)  # pyright: ignore
     else:
@@ -55,5 +56,6 @@ def common_path(
         return path
     if cell is None:
         return LevyAreaBrownianPath(path, key)
-    # A step samples all of its cells, so these have no Fourier terms, which cost time.
+    # A step samples the areas of each of its cells. Fourier terms in each cell would cost
+    # time, so there are none.
     return LevyAreaBrownianPath(path, key, num_terms=0, cell=float(cell))

@@ -1,4 +1,8 @@
-"""The pieces of a splitting: each moves momenta or positions, for a share of the step."""
+"""The pieces of a splitting: each moves momenta or positions, for a share of the step.
+
+A step passes a `Moving`, which holds the state, from piece to piece. What stays the same
+for all pieces of the step is in a `Setting`.
+"""
 
 import abc
 import dataclasses
@@ -21,6 +25,7 @@ from .._custom_types import Args, RealScalarLike, Terms, Y
 from .._terms import (
     apply,
     constraint_of,
+    NormalSpace,
     rate,
     slow_apart,
     split_friction,
@@ -45,41 +50,42 @@ class Setting(NamedTuple):
 
     - `kicks`: the terms whose forces are the kicks.
     - `rest`: the terms that free flight or flows follow.
-    - `friction`, `noise`: the terms of the baths. Without friction the noise acts in the
-        kick, of which there is one.
-    - `increments`: of each bath in turn, or of the kick, those of all noises.
+    - `friction`, `noise`: the terms of the baths. Without friction there is one kick and no
+        bath, and the noise acts in the kick.
     - `args`: as for `diffrax.diffeqsolve`.
     - `length`, `time`: functions of a share `s` of the step, such as 0.5: the length `s h`
         of this share, and the time `t0 + s h` after it.
     - `surface`: the surface of the constraint, if there is one.
-    - `pending`: whether multipliers have to be found: not for a path that failed before.
+    - `increments`: for each bath in turn, or for the kick, a list of the increments of all
+        noise terms.
+    - `pending`: with a constraint, whether to find multipliers: not for a path that failed
+        before.
     """
 
     kicks: Terms
     rest: Terms
     friction: Terms
     noise: Terms
-    increments: list[list]
     args: Args
     length: Callable[[float], RealScalarLike]
     time: Callable[[float], RealScalarLike]
-    surface: Surface | None = None
+    surface: Surface | None
+    increments: list[list] = []
     pending: Bool[Array, ""] | bool = True
 
 
 def kicks_and_rest(has_flow: bool, drift: Terms) -> tuple[Terms, Terms]:
-    """The terms whose forces are the kicks of a splitting, and the terms that its flow
-    follows, or free flight."""
-    # Kicks take the forces of the whole drift, and free flight its velocities.
+    """The terms whose forces are the kicks of a splitting, and the terms that its flow, or
+    its free flight, follows."""
+    # Without a flow, kicks take the forces of the drift, and free flight its velocities.
     if not has_flow:
         return drift, drift
     rest, slow = slow_apart(drift)
     return slow, rest
 
 
-def setting_of(has_flow: bool, terms, t0, t1, y0: Y, args: Args) -> Setting:
-    """The setting of a step from `y0`, but for `increments` and `pending`, for terms with
-    the momentum first."""
+def setting_of(terms, t0, t1, y0: Y, args: Args, has_flow: bool) -> Setting:
+    """The setting of a step from `y0 = (p, q)`, without `increments` and `pending`."""
     drift, friction, noise = split_friction(without_constraint(terms))
     kicks, rest = kicks_and_rest(has_flow, drift)
     h = t1 - t0
@@ -91,32 +97,32 @@ def setting_of(has_flow: bool, terms, t0, t1, y0: Y, args: Args) -> Setting:
 
     @ft.cache
     def time(share: float) -> RealScalarLike:
-        # The end is exactly `t1`.
-        if share == 1:
-            return t1
-        return t0 if share == 0 else t0 + length(share)
+        if share == 0:
+            return t0
+        # The rounding of `t0 + h` may differ from `t1`.
+        return t1 if share == 1 else t0 + length(share)
 
-    setting = Setting(kicks, rest, friction, noise, [], args, length, time)
+    surface = None
     constraint = constraint_of(terms)
-    if constraint is None:
-        return setting
-    # A solver that is the flow gets only the terms in `rest`, so one of them has to carry
-    # the constraint.
-    first, *others = rest
-    first = wrapped_like(first, with_constraint(unwrapped(first), constraint))
-    surface = Surface.of(terms, t0, y0, args)
-    return setting._replace(rest=(first, *others), surface=surface)
+    if constraint is not None:
+        surface = Surface.of(terms, t0, y0, args)
+        # A flow that is a solver gets only the terms in `rest`, so that one of these has to
+        # carry the constraint.
+        first, *others = rest
+        first = wrapped_like(first, with_constraint(unwrapped(first), constraint))
+        rest = (first, *others)
+    return Setting(kicks, rest, friction, noise, args, length, time, surface)
 
 
 class Moving(NamedTuple):
     """The state in the course of a step.
 
     - `y`: the momenta and positions.
-    - `forces`: those of the kicks at `y`, if they are known.
-    - `flows`: by the number of its first piece, the state of each flow: of a solver its
-        state, of a function whether it returned NaN at the start.
-    - `results`: by the same numbers, the last result of each flow. It tells of all: after a
-        failure the state makes all further results failures, too.
+    - `forces`: the forces of the kicks at `y`, if they are known.
+    - `flows`: the state of each flow, by the number of its first piece. For a solver it is
+        the solver state, for a function whether it returned NaN at the start of the solve.
+    - `results`: the last result of each flow that has moved, by the same numbers. Earlier
+        results are not needed: after a failure all results of the flow are failures.
     - `elapsed`: the share of the step for which positions have moved.
     - `num_baths`: how many baths have acted.
     - `normal_space`: with a constraint, the directions normal to it at `y`, if known.
@@ -135,8 +141,8 @@ class Moving(NamedTuple):
     found: Any = True
 
     def after_move(self, y: Y, share: float, **changes: Any) -> "Moving":
-        """The state after the positions have moved for this share of the step. Forces and
-        normals, known at the old positions, are dropped."""
+        """The state after positions have moved to those of `y`, for this share of the step.
+        Forces and normals are dropped, since they belong to the old positions."""
         return self._replace(
             y=y,
             forces=None,
@@ -148,7 +154,7 @@ class Moving(NamedTuple):
 
     def elapsed_after(self, share: float) -> float:
         """`elapsed` after a further share. Rounding errors of the sum are removed, so that
-        equal times, such as those after 0.1 + 0.2 and 0.3 of a step, are computed once."""
+        0.1 + 0.2 and 0.3 of a step are the same time, which is computed only once."""
         return round(self.elapsed + share, 12)
 
     def with_normal_space(self, surface: Surface) -> "Moving":
@@ -177,7 +183,8 @@ class AbstractPiece(eqx.Module):
 
     @abc.abstractmethod
     def move(self, setting: Setting, moving: Moving, number: int) -> Moving:
-        """The state after this piece. `number` is that of the first piece that is alike.
+        """The state after this piece. `number` is the number of the first piece that is
+        alike, by which `moving` holds the state of a flow.
 
         Lengths in `setting` are positive in a solve backward in time, too. `rate` and
         `apply` take the direction of time from the terms; any other motion multiplies its
@@ -212,14 +219,14 @@ class Kick(AbstractPiece):
         return moving._replace(y=(p, q), forces=forces, is_tangent=False)
 
 
-def _moved(x: PyTree, time: RealScalarLike, rate: PyTree) -> PyTree:
-    """`x` after `time` at a constant rate."""
+def _moved(x: PyTree, length: RealScalarLike, slope: PyTree) -> PyTree:
+    """`x + length * slope`. Times may have a higher precision than `x`, and the result has
+    that of `x`."""
 
-    def moved_leaf(x: Array, rate: Array) -> Array:
-        # The time is converted to the precision of the state, which it need not have.
-        return x + jnp.asarray(time, jnp.result_type(x)) * rate
+    def moved_leaf(x: Array, slope: Array) -> Array:
+        return x + jnp.asarray(length, jnp.result_type(x)) * slope
 
-    return jtu.tree_map(moved_leaf, x, rate)
+    return jtu.tree_map(moved_leaf, x, slope)
 
 
 class Flight(AbstractPiece):
@@ -235,22 +242,22 @@ class Flight(AbstractPiece):
 
     def move(self, setting, moving, number):
         length = setting.length(self.share)
-        if setting.surface is not None:
-            moving = moving.with_normal_space(setting.surface)
+        surface = setting.surface
+        if surface is not None:
+            moving = moving.with_normal_space(surface)
             (p, unravel_p), (q, unravel_q) = map(jfu.ravel_pytree, moving.y)
-            length = jnp.asarray(length, p.dtype)
-            p, q, found = setting.surface.free_flight(
+            p, q, found = surface.free_flight(
                 p, moving.normal_space, length, setting.pending
             )
             y = (unravel_p(p), unravel_q(q))
             return moving.after_move(y, self.share, found=moving.found & found)
         p, q = moving.y
-        # Velocities do not depend on time, so any time will do. The start of the step for
-        # the first flight, and its end for the last one, are times at which the kicks of
-        # `BAOAB` evaluate forces: XLA then computes once what depends on time alone. Of the
-        # rates only the velocities are used; XLA drops the forces.
+        # Velocities do not depend on time, so any time will do. The kicks of `BAOAB`
+        # evaluate forces at the start and at the end of the step. With the same times for
+        # the first and the last flight, XLA computes once what depends on time alone.
         is_first = moving.elapsed == 0
         time = setting.time(0.0 if is_first else moving.elapsed_after(self.share))
+        # The forces are not used, so XLA drops their computation.
         _, velocities = rate(setting.rest, time, moving.y, setting.args)
         return moving.after_move((p, _moved(q, length, velocities)), self.share)
 
@@ -293,7 +300,7 @@ class Flow(AbstractPiece):
 
     def begin(self, setting: Setting, t0, t1, y0: Y) -> PyTree[Array]:
         """The state of the flow at the start of a solve, whose first step is from `t0` to
-        `t1`: of a solver its state, of a function whether it returns NaN."""
+        `t1`: of a solver its state, of a function whether it returns NaN for `y0`."""
         if is_solver(self.flow):
             terms = diffrax.MultiTerm(*setting.rest)
             return self.flow.init(terms, t0, t1, y0, setting.args)  # pyright: ignore
@@ -309,6 +316,7 @@ class Flow(AbstractPiece):
             time = direction(setting.rest) * setting.length(self.share)
             y = self.flow(time, moving.y, setting.args)  # pyright: ignore
             R: Any = diffrax.RESULTS
+            # The state of a function is whether it returned NaN at the start of the solve.
             result = R.where(state, R.nonfinite, result_of(None, y))
         return moving.after_move(
             y,
@@ -320,7 +328,8 @@ class Flow(AbstractPiece):
     def _after_steps(
         self, setting: Setting, moving: Moving, state: PyTree[Array]
     ) -> tuple[Y, PyTree[Array], diffrax.RESULTS]:
-        """The state after all steps of a solver, the solver's state, and the result."""
+        """`y`, the solver state and the result after all steps of a flow that is a solver,
+        from the solver state before."""
         solver: Any = self.flow
         terms = diffrax.MultiTerm(*setting.rest)
         t0 = setting.time(moving.elapsed)
@@ -330,8 +339,8 @@ class Flow(AbstractPiece):
         def step(carry: tuple[Any, ...], index: Any) -> tuple[tuple[Any, ...], None]:
             y, state, _ = carry
             start = t0 + index * h
-            # What the bath did is a jump for a solver that remembers the end of its last
-            # step.
+            # For a solver that remembers the end of its last step, the change of the state
+            # by a bath since then is a jump.
             made_jump = True
             y, _, _, state, result = solver.step(
                 terms, start, start + h, y, setting.args, state, made_jump
@@ -342,8 +351,8 @@ class Flow(AbstractPiece):
         if self.steps == 1:
             carry, _ = step(carry, 0)
         else:
-            # The last result tells of all: after a failure the state of the solver, or a
-            # state that is not finite, makes all further steps fail.
+            # The last result suffices: after a failure all further steps fail, since the
+            # solver state records it, or since `y` is not finite.
             carry, _ = lax.scan(step, carry, jnp.arange(self.steps))
         return carry
 
@@ -380,42 +389,54 @@ class Bath(AbstractPiece):
         length = setting.length(self.share)
         if setting.noise:
             increments = setting.increments[moving.num_baths]
-            impulse, _ = apply(setting.noise, increments, setting.args, time, y)
+            noise_impulse, _ = apply(setting.noise, increments, setting.args, time, y)
         else:
-            impulse = jtu.tree_map(jnp.zeros_like, p)
-
-        def after_bath(impulse: PyTree[Array]) -> PyTree[Array]:
-            """The momenta after friction, and an impulse spread over the length of it. It
-            is linear in the impulse, up to a constant."""
-            friction = setting.friction
-            return after_friction(friction, time, length, y, setting.args, impulse)
-
+            noise_impulse = jtu.tree_map(jnp.zeros_like, p)
+        after_impulse = ft.partial(
+            after_friction, setting.friction, time, length, y, setting.args
+        )
         if surface is None:
-            p = after_bath(impulse)
+            p = after_impulse(noise_impulse)
         else:
-            flat_impulse, unravel = jfu.ravel_pytree(impulse)
-
-            def flat_after_bath(impulse: Array) -> Array:
-                return jfu.ravel_pytree(after_bath(unravel(impulse)))[0]
-
-            # The impulses of the constraint forces, which make the momenta tangent, enter
-            # as that of the noise does, so that friction acts on them, too: then friction
-            # and noise are the midpoint rule within the tangent space, which keeps its
-            # Maxwell distribution.
-            def response(normal: Array) -> Array:
-                """The change of the momenta by a unit impulse along this normal."""
-                _, change_of_p = jax.jvp(flat_after_bath, (flat_impulse,), (normal,))
-                return change_of_p
-
-            flat_p = flat_after_bath(flat_impulse)
-            p = unravel(surface.tangent(flat_p, moving.normal_space, response))
+            p = _tangent_after_friction(
+                after_impulse, noise_impulse, surface, moving.normal_space
+            )
         return moving._replace(y=(p, q), num_baths=moving.num_baths + 1)
+
+
+def _tangent_after_friction(
+    after_impulse: Callable[[PyTree[Array]], PyTree[Array]],
+    noise_impulse: PyTree[Array],
+    surface: Surface,
+    normal_space: NormalSpace,
+) -> PyTree[Array]:
+    """The momenta after friction and noise, tangent to the surface of a constraint.
+    `after_impulse(x)` are the momenta after friction and the impulse `x`, in which it is
+    linear up to a constant.
+
+    The constraint forces give impulses along the normals. Friction acts on them as on the
+    impulse of the noise: then friction and noise are the midpoint rule within the tangent
+    space, which keeps its Maxwell distribution.
+    """
+    flat_noise_impulse, unravel = jfu.ravel_pytree(noise_impulse)
+
+    def flat_after_impulse(impulse: Array) -> Array:
+        return jfu.ravel_pytree(after_impulse(unravel(impulse)))[0]
+
+    def response(normal: Array) -> Array:
+        """The change of the momenta by a unit impulse along this normal."""
+        _, change_of_p = jax.jvp(flat_after_impulse, (flat_noise_impulse,), (normal,))
+        return change_of_p
+
+    flat_p = flat_after_impulse(flat_noise_impulse)
+    return unravel(surface.tangent(flat_p, normal_space, response))
 
 
 def first_alike(pieces: tuple[AbstractPiece, ...]) -> tuple[int, ...]:
     """For each piece the number of the first piece that is alike, which is its own number
-    if none before it is. Flows that are alike share one state, kept under this number.
-    Pieces are alike if all of their fields are: equal if static, else the same object."""
+    if none before it is alike. Flows that are alike share one state, kept by this number.
+    Pieces are alike if they have the same class, and their static fields are equal and all
+    other fields the same object."""
 
     def are_alike(one: AbstractPiece, other: AbstractPiece) -> bool:
         if type(one) is not type(other):

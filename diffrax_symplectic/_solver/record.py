@@ -11,7 +11,7 @@ Order: TypeAlias = int | float | tuple[int | float, int | float]
 
 class Record(NamedTuple):
     """Facts about a solver that do not follow from its coefficients. Orders, suggestions,
-    the tables of the documentation and the tests of all solvers are made from it.
+    the tables of the documentation and the tests of all solvers are made from its record.
 
     - `weak`: its weak order.
     - `strong`: its strong order, or `None` for a weak method.
@@ -28,11 +28,11 @@ class Record(NamedTuple):
     - `most_frequency`: the largest frequency of the drift, as omega h, up to which two
         levels were measured to hold their error bars; `None` if nothing is promised.
 
-    The last four are measured, in `tests/test_advice.py`, for the solvers that
-    `suggest_solver` returns. Leave them out for others: the page then promises and warns of
-    nothing. For `LevyAreaMidpoint` they cannot be computed, since its random variables have
-    no finite set of outcomes: its record repeats that of the midpoint rule, and a test
-    compares the steps of both.
+    The last four fields are measured, in `tests/test_advice.py`, for the solvers that
+    `suggest_solver` returns. Leave them out for other solvers: the documentation then
+    promises nothing and warns of nothing. For `LevyAreaMidpoint` they cannot be computed,
+    since its random variables have no finite set of outcomes. Its record repeats that of
+    the midpoint rule, and a test compares the steps of both.
     """
 
     weak: Order
@@ -46,7 +46,7 @@ class Record(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """When to choose it, and its limits by `most_frequency`,
+        """When to choose the solver, and its limits by `most_frequency`,
         `right_energy_unresolved` and `most_friction`, in sentences for users."""
         sentences = [self.choose]
         if self.most_frequency is not None:
@@ -63,7 +63,7 @@ class Record(NamedTuple):
         return " ".join(sentences)
 
     def order(self, want: Want, commute: bool) -> int | float | None:
-        """The order for noises that commute, or for others."""
+        """The weak or strong order: for noises that commute, or for others."""
         order = self.weak if want == "weak" else self.strong
         if not isinstance(order, tuple):
             return order

@@ -12,7 +12,7 @@ from .base import (
     AbstractSymplecticRungeKutta,
     free_parameter,
 )
-from .constrained import end_and_outcome, init_constrained
+from .constrained import end_on_surface, init_constrained
 from .driven import drawn_variables
 from .pieces import Flight, Kick, Moving, setting_of
 from .record import Record
@@ -180,7 +180,7 @@ class SRKs3(AbstractSymplecticRungeKutta, AbstractImplicitStages):
         return SeparableTableau(alpha=alpha, beta=[1], A0=A0, B0=[[0], [0]], A1=[alpha])
 
 
-# The tableau of `StormerVerlet` in pieces, whose flights keep a constraint.
+# A step of `StormerVerlet` as the pieces of a splitting, whose flights keep a constraint.
 _CONSTRAINED_STEP = (Flight(1 / 2), Kick(1), Flight(1 / 2))
 
 
@@ -238,19 +238,19 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         if constraint_of(terms) is None:
             return super().step(terms, t0, t1, y0, args, solver_state, made_jump)
-        setting = setting_of(False, terms, t0, t1, y0, args)
+        setting = setting_of(terms, t0, t1, y0, args, has_flow=False)
         increments = []
         if setting.noise:
             name = type(self).__name__
             increments = drawn_variables(setting.noise, ["W"], t0, t1, name)["W"]
-        # A path that failed before needs no multipliers: in a batch, others would wait.
+        # Multipliers are not sought for a path that failed before: others would wait.
         pending = solver_state == optx.RESULTS.successful
         setting = setting._replace(increments=[increments], pending=pending)
         moving = Moving(y0, forces=None, flows={})
         for number, piece in enumerate(_CONSTRAINED_STEP):
             moving = piece.move(setting, moving, number)
-        moving = moving.made_tangent(setting.surface)  # pyright: ignore
-        y1, outcome = end_and_outcome(moving.y, moving.found, solver_state)
+        assert setting.surface is not None
+        y1, outcome = end_on_surface(moving, setting.surface, solver_state)
         result = result_with_times_checked(terms, t0, t1, result_of(outcome, y1))
         return y1, None, dict(y0=y0, y1=y1), outcome, result
 
@@ -258,21 +258,6 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
 # The three kicks of `PlateauVerlet`, as combinations of random variables: with
 # M = W / 2 + H these are M - C, 2 C and W - M - C.
 _KICKS = {"W": [1 / 2, 0, 1 / 2], "H": [1, 0, -1], "C": [-1, 2, -1]}
-_plateau_verlet = PartitionedTableau(
-    alpha=[1 / 2, 1 / 2],
-    alpha_hat=[1 / 4, 1 / 4, 1 / 4, 1 / 4],
-    beta=_KICKS,
-    # The momenta after the first kick, the first force, the second kick, the second force.
-    A=[[0, 0], [1 / 2, 0], [1 / 2, 0], [1 / 2, 1 / 2]],
-    A_hat=[[1 / 4, 0, 0, 0], [1 / 4, 1 / 4, 1 / 4, 0]],
-    # Momenta contain the kicks that came before. The last kick is in none of them.
-    B0={
-        name: [[first, 0, 0], [first, 0, 0], [first, second, 0], [first, second, 0]]
-        for name, (first, second, _) in _KICKS.items()
-    },
-    # The positions of the three kicks: at the start, in the middle and at the end.
-    A1=[[0, 0, 0, 0], [1 / 4, 1 / 4, 0, 0], [1 / 4, 1 / 4, 1 / 4, 1 / 4]],
-)
 
 
 class PlateauVerlet(AbstractSymplecticRungeKutta):
@@ -306,4 +291,19 @@ class PlateauVerlet(AbstractSymplecticRungeKutta):
         strong=3 / 2,
         choose="Explicit, with accurate paths. Not for frequencies omega > 4 / h.",
     )
-    tableau: ClassVar[PartitionedTableau] = _plateau_verlet
+    tableau: ClassVar[PartitionedTableau] = PartitionedTableau(
+        alpha=[1 / 2, 1 / 2],
+        alpha_hat=[1 / 4, 1 / 4, 1 / 4, 1 / 4],
+        beta=_KICKS,
+        # The momenta after the first kick, the first force, the second kick and the second
+        # force.
+        A=[[0, 0], [1 / 2, 0], [1 / 2, 0], [1 / 2, 1 / 2]],
+        A_hat=[[1 / 4, 0, 0, 0], [1 / 4, 1 / 4, 1 / 4, 0]],
+        # Momenta contain the kicks that came before. The last kick is in none of them.
+        B0={
+            name: [[first, 0, 0], [first, 0, 0], [first, second, 0], [first, second, 0]]
+            for name, (first, second, _) in _KICKS.items()
+        },
+        # The positions of the three kicks: at the start, in the middle and at the end.
+        A1=[[0, 0, 0, 0], [1 / 4, 1 / 4, 0, 0], [1 / 4, 1 / 4, 1 / 4, 1 / 4]],
+    )

@@ -23,7 +23,7 @@ from .._terms import (
 )
 from .base import AbstractSymplecticSolver
 from .bath import check_friction
-from .constrained import end_and_outcome, init_constrained
+from .constrained import end_on_surface, init_constrained
 from .driven import drawn_variables
 from .flow import Flow as AnyFlow, is_solver
 from .pieces import (
@@ -35,10 +35,11 @@ from .pieces import (
     Kick,
     kicks_and_rest,
     Moving,
+    Setting,
     setting_of,
 )
 from .record import Record
-from .step import result_of
+from .step import Outcome, result_of
 from .times import result_with_times_checked
 
 
@@ -51,14 +52,16 @@ else:
 class SplittingState(NamedTuple):
     """What a splitting hands on from the end of a step to the start of the next one.
 
-    - `forces`: those of the kicks, if a step begins and ends with them.
+    - `forces`: the forces of the last kick if they serve for the first kick of the next
+        step, else `None`.
     - `flows`: the states of the flows, as in `Moving`.
-    - `outcome`: with a constraint, whether its multipliers were found in all steps so far.
+    - `outcome`: with a constraint, whether its multipliers were found in all steps so far;
+        otherwise `None`.
     """
 
     forces: PyTree[Array]
     flows: dict[int, PyTree[Array]]
-    outcome: optx.RESULTS | None
+    outcome: Outcome
 
 
 class AbstractLangevinSplitting(AbstractSymplecticSolver):
@@ -67,12 +70,12 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
     pieces: AbstractVar[tuple[AbstractPiece, ...]]
 
     def _first_alike(self) -> tuple[int, ...]:
-        """For each piece the number of the first one that is alike."""
+        """What `first_alike` returns for the pieces."""
         return first_alike(self.pieces)
 
     @property
     def variables(self) -> tuple[str, ...]:
-        # With `H` the increment of a step is shared between two baths.
+        # Two baths need `H` for independent shares of the increment of a step.
         return ("W", "H") if len(self._baths) == 2 else ("W",)
 
     @property
@@ -88,8 +91,8 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
 
     @property
     def kicks_at_ends(self) -> bool:
-        """Whether a step kicks before positions move and after they last did. Then the
-        forces of its last kick serve for the first kick of the next step, too."""
+        """Whether a step kicks before positions first move, and after they last move. Then
+        the forces of its last kick serve for the first kick of the next step, too."""
         moves = [i for i, piece in enumerate(self.pieces) if piece.moves_positions]
         kicks = [i for i, piece in enumerate(self.pieces) if isinstance(piece, Kick)]
         return kicks[0] < moves[0] and kicks[-1] > moves[-1]
@@ -101,10 +104,9 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
     @property
     def _flows(self) -> dict[int, Flow]:
         """The flows, each once, by the number of the first piece that is this flow."""
+        first_pieces = {number: self.pieces[number] for number in self._first_alike()}
         return {
-            number: piece
-            for number, piece in enumerate(self.pieces)
-            if isinstance(piece, Flow) and self._first_alike()[number] == number
+            i: piece for i, piece in first_pieces.items() if isinstance(piece, Flow)
         }
 
     @property
@@ -116,8 +118,9 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
 
     @property
     def friction_without_inverse(self) -> float:
-        """The smallest rate of friction times step for which a step shrinks areas to zero,
-        and has no inverse: one bath, the midpoint rule, does so."""
+        """The smallest rate of friction times step size for which a step has no inverse.
+        For `2 / s`, a bath with the share `s` multiplies momenta by zero: it is a step of
+        the midpoint rule."""
         return 2 / max(bath.share for bath in self._baths)
 
     def stage_vectors(self, num_noises):
@@ -149,40 +152,48 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
             piece.check_follows(rest, t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args) -> Any:
-        outcome = None
-        if constraint_of(terms) is not None and self.keeps_constraints:
-            for piece in self._flows.values():
-                if not getattr(piece.flow, "keeps_constraints", False):
-                    raise ValueError(
-                        f"The flow {piece.flow!r} does not keep the constraint of the "
-                        "terms. Use `BAOAB()` or `BAOAB(StormerVerlet())`."
-                    )
-            outcome = init_constrained(self, terms, t0, y0, args)
-        else:
-            self.check(terms, t0, y0, args)
+        """Checks the arguments, and makes the state with which the first step begins."""
+        outcome = self._outcome_at_start(terms, t0, y0, args)
         terms, y0 = momentum_first(terms, y0)
-        setting = setting_of(self.has_flow, terms, t0, t1, y0, args)
+        setting = setting_of(terms, t0, t1, y0, args, self.has_flow)
         forces = None
         if self.kicks_at_ends and setting.kicks:
             forces, _ = rate(setting.kicks, t0, y0, args)
         flows = {
-            number: piece.begin(setting, t0, t1, y0)
-            for number, piece in self._flows.items()
+            number: flow.begin(setting, t0, t1, y0)
+            for number, flow in self._flows.items()
         }
         return SplittingState(forces, flows, outcome)
 
+    def _outcome_at_start(self, terms, t0, y0: Y, args: Args) -> Outcome:
+        """The `outcome` of a `SplittingState` before the first step. Raises a `ValueError`
+        unless the state and the terms suit the solver."""
+        if constraint_of(terms) is None or not self.keeps_constraints:
+            # This refuses a constraint that the solver does not keep.
+            self.check(terms, t0, y0, args)
+            return None
+        for piece in self._flows.values():
+            if not getattr(piece.flow, "keeps_constraints", False):
+                raise ValueError(
+                    f"The flow {piece.flow!r} does not keep the constraint of the "
+                    "terms. Use `BAOAB()` or `BAOAB(StormerVerlet())`."
+                )
+        return init_constrained(self, terms, t0, y0, args)
+
     def _increments(self, noise: Terms, t0, t1) -> list[list]:
-        """For each bath the increments of its share of the step, one for each noise."""
+        """For each bath the increments of all noise terms in its share of the step. Empty
+        without noise."""
         if len(noise) == 0:
             return []
         names = list(self.variables)
         variables = drawn_variables(noise, names, t0, t1, type(self).__name__)
         if names == ["W"]:
             return [variables["W"]]
-        # W and H are independent, with the variances h and h / 12. So with the share s and
-        # w^2 = 12 s (1 - s), the first part s W + w H has the variance (s^2 + w^2 / 12) h =
-        # s h. The rest, (1 - s) W - w H, has the variance (1 - s) h, and the covariance of
-        # both is (s (1 - s) - w^2 / 12) h = 0.
+        # W and H are independent, with the variances h and h / 12. Let s be the share of
+        # the first bath, and w^2 = 12 s (1 - s). Then the increment s W + w H of the first
+        # bath has the variance (s^2 + w^2 / 12) h = s h. The rest of W, (1 - s) W - w H, is
+        # the increment of the second bath. It has the variance (1 - s) h, and the
+        # covariance of both increments is (s (1 - s) - w^2 / 12) h = 0.
         share, _ = [bath.share for bath in self._baths]
         weight = math.sqrt(12 * share * (1 - share))
         W = variables["W"]
@@ -190,47 +201,49 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         return [first, (W**ω - first**ω).ω]
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
-        # The user's own terms and state: those of Diffrax have the state (x, v).
-        own_terms = terms
-        own_y0 = y0
-        terms, y0 = momentum_first(own_terms, own_y0)
+        # Diffrax's own Langevin terms have the state (x, v). Within the step the momentum
+        # comes first.
+        ordered_terms, start = momentum_first(terms, y0)
         forces, flows, outcome = solver_state
-        setting = setting_of(self.has_flow, terms, t0, t1, y0, args)
+        setting = setting_of(ordered_terms, t0, t1, start, args, self.has_flow)
         increments = self._increments(setting.noise, t0, t1)
         setting = setting._replace(increments=increments)
         if setting.surface is not None:
             setting = setting._replace(pending=outcome == optx.RESULTS.successful)
-        # The forces at the end of the last step, unless the state jumped since then.
+        # `forces` are those at the end of the last step. The state may have jumped since.
         if forces is not None and made_jump is not False:
-            last_forces = forces
-
-            def compute_forces() -> PyTree[Array]:
-                forces, _ = rate(setting.kicks, t0, y0, args)
-                return forces
-
-            forces = lax.cond(made_jump, compute_forces, lambda: last_forces)
-        moving = Moving(y0, forces, flows)
+            forces = _forces_after_jump(setting, forces, made_jump, t0, start)
+        moving = Moving(start, forces, flows)
         for number, piece in zip(self._first_alike(), self.pieces):
             moving = piece.move(setting, moving, number)
-        R: Any = diffrax.RESULTS
         if setting.surface is None:
-            y1 = moving.y
-            result = result_of(None, y1)
+            end = moving.y
+            result = result_of(None, end)
+            R: Any = diffrax.RESULTS
             for flow_result in moving.results.values():
                 result = R.where(flow_result == R.successful, result, flow_result)
         else:
-            found = moving.found
-            for flow_result in moving.results.values():
-                found = found & (flow_result == R.successful)
-            moving = moving.made_tangent(setting.surface)
-            y1, outcome = end_and_outcome(moving.y, found, outcome)
-            result = result_of(outcome, y1)
-        result = result_with_times_checked(terms, t0, t1, result)
-        # If the state is Diffrax's (x, v), its halves are exchanged once more.
-        _, y1 = momentum_first(own_terms, y1)
+            end, outcome = end_on_surface(moving, setting.surface, outcome)
+            result = result_of(outcome, end)
+        result = result_with_times_checked(ordered_terms, t0, t1, result)
+        # This exchanges the halves of Diffrax's own state once more.
+        _, y1 = momentum_first(terms, end)
         forces = moving.forces if self.kicks_at_ends else None
         state = SplittingState(forces, moving.flows, outcome)
-        return y1, None, dict(y0=own_y0, y1=y1), state, result
+        return y1, None, dict(y0=y0, y1=y1), state, result
+
+
+def _forces_after_jump(
+    setting: Setting, last_forces: PyTree[Array], made_jump, t0, y0: Y
+) -> PyTree[Array]:
+    """The forces at the start `y0` of a step: `last_forces`, which are those at the end of
+    the last step, unless the state jumped since then."""
+
+    def compute_forces() -> PyTree[Array]:
+        forces, _ = rate(setting.kicks, t0, y0, setting.args)
+        return forces
+
+    return lax.cond(made_jump, compute_forces, lambda: last_forces)
 
 
 def check_has_no_bath(flow: AnyFlow) -> None:
@@ -261,13 +274,13 @@ class Splitting(AbstractLangevinSplitting):
     step; in place of free flight there may be a [`diffrax_symplectic.Flow`][]. Takes the
     same terms and states as [`diffrax_symplectic.BAOAB`][], also with constraints.
 
-    All else follows from the pieces. Pieces that are the same in reverse have weak order 2,
-    and order 2 without noise; all others order 1; the strong order is 1. A kick at the end
-    of a step shares its forces with one at the start of the next step. Of two baths each
-    gets independent noise for its share of the step, from the increment $W$ and the
-    space-time Lévy area $H$ of the step: for the shares $s$ and $1 - s$ these are
-    $s W + \sqrt{12 s (1 - s)}\, H$ and the rest of $W$. So with two baths the path needs
-    $H$, as made by `solver.path(shape, key)`.
+    All else follows from the pieces. If they are the same in reverse, the weak order is 2,
+    as is the order without noise; otherwise both are 1. The strong order is 1. A kick at
+    the end of a step shares its forces with one at the start of the next step. Two baths
+    get independent increments for their shares $s$ and $1 - s$ of the step:
+    $s W + \sqrt{12 s (1 - s)}\, H$ and the rest of $W$, where $W$ is the increment and $H$
+    the space-time Lévy area of the step. So with two baths the path needs $H$, as made by
+    `solver.path(shape, key)`.
 
     Which stationary moments are exact depends on the order: in a harmonic well, the
     momenta of OBABO, and the positions of BAOAB and ABOBA.
@@ -285,7 +298,8 @@ class Splitting(AbstractLangevinSplitting):
     """
 
     pieces: tuple[AbstractPiece, ...]
-    # Found when made: a compiled program would not know which flows are the same.
+    # `first_alike(pieces)`, computed when the solver is made. Flows that are alike are the
+    # same object, but no longer so in a compiled program, which makes its arguments anew.
     positions: tuple[int, ...] = eqx.field(static=True, repr=False)
 
     keeps_constraints: ClassVar[bool] = True
@@ -325,9 +339,9 @@ def _checked_pieces(pieces: Any) -> tuple[AbstractPiece, ...]:
         raise ValueError(
             "A `Splitting` with a `Flow` has no `Flight`: the flow moves the positions."
         )
-    # Those without which nothing moves, and all others.
-    needed = Kick, Bath, Flow if has_flow else Flight
-    for kind in dict.fromkeys((*needed, *map(type, pieces))):
+    # The first three kinds are needed: shares of a kind that is missing add up to zero.
+    kinds = [Kick, Bath, Flow if has_flow else Flight, *map(type, pieces)]
+    for kind in dict.fromkeys(kinds):
         total = sum(piece.share for piece in pieces if isinstance(piece, kind))
         if abs(total - 1) > 1e-12:
             raise ValueError(

@@ -1,5 +1,10 @@
-"""A step by the plan of a tableau: its stages, and the solution of the stage equations with
-implicit differentiation."""
+"""A step of a Runge--Kutta method, by the plan of its tableau.
+
+The plan orders the stages in blocks. A block has unknown stages, whose values k solve the
+stage equations k = Phi(k), and explicit stages, which are evaluated from values that are
+known already. A root finder solves the stage equations; derivatives of a step follow from
+the equations by the implicit function theorem, not from the iterations.
+"""
 
 import functools as ft
 from collections.abc import Callable, Iterable
@@ -27,19 +32,14 @@ from .._terms import tree_sum
 _Value: TypeAlias = PyTree[Array]
 # The values of the stages known so far, by stage number.
 KnownValues: TypeAlias = dict[int, _Value]
-# The values of the unknown stages, by group. In the comments and root finders these are the
-# unknowns k.
+# The values of the unknown stages, by group. Comments and root finders call them k.
 Unknown: TypeAlias = dict[Group, _Value]
-# The halves of a change are computed together if one by one they take more than so many
-# times the operations: 2 times if they share all of them, once if they share none. Then
-# sweeps over a doubled system cost about the same and are fewer. For a qubit under
-# measurement (1.76 times) steps take 24 evaluations in place of 44 for one path, and 65 in
-# place of 106 for the slowest of 1,024; for amplitudes on four sites (1.77) and two damped
-# spins (1.58) 0.63 to 0.74 times as many sweeps, from h = 0.1 to 0.6.
-_LEAST_RATIO_TOGETHER = 1.5
 # The change of the state by one channel over the whole step, its vector field times its
 # control, as a function of time and state.
 Change: TypeAlias = Callable[[RealScalarLike, Y], Y]
+# Whether the stage equations of all steps so far were solved: success, or the first
+# failure. `None` for a solver without stage equations.
+Outcome: TypeAlias = optx.RESULTS | None
 
 
 class Step(NamedTuple):
@@ -55,17 +55,18 @@ class Step(NamedTuple):
 
 
 class Stages(eqx.Module):
-    """The stages of one step, in the blocks of its plan. While a block is solved, values of
-    later blocks count as zero: earlier blocks do not depend on these."""
+    """The stages of one step from the state `y0`, in the blocks of its plan. No block
+    depends on a later one: while it is solved, values of later blocks count as zero."""
 
     plan: StepPlan = eqx.field(static=True)
     step: Step
     y0: Y
-    # Whether sweeps may update momenta and positions one after the other.
+    # Whether sweeps, the fixed-point iterations of a root finder, may update momenta and
+    # positions one after the other.
     in_halves: bool = eqx.field(static=True, default=True)
 
     def _start(self, group: Group) -> PyTree[Array]:
-        """The part of the state at the start of the step that these stages change."""
+        """The part of `y0` that the stages of a group change."""
         return _part(self.y0, self.plan.tableau.stages[group[0]].writes)
 
     def zeros(self) -> Unknown:
@@ -75,10 +76,10 @@ class Stages(eqx.Module):
             # The value of one stage alone is not stacked.
             stacked_axis = (len(group),) if len(group) > 1 else ()
 
-            def zeros(x: Array) -> Array:
+            def stacked_zeros(x: Array) -> Array:
                 return jnp.zeros((*stacked_axis, *jnp.shape(x)), jnp.result_type(x))
 
-            return jtu.tree_map(zeros, self._start(group))
+            return jtu.tree_map(stacked_zeros, self._start(group))
 
         groups = [group for block in self.plan.blocks for group in block.unknown]
         return {group: zeros_for(group) for group in groups}
@@ -87,8 +88,8 @@ class Stages(eqx.Module):
         """The size of the state that unknown values change, which sets their tolerance."""
 
         def size(y: Array, value: Array) -> Array:
-            # At rest the state may be zero, and the value alone is the scale. The state
-            # broadcasts against the values of several stages.
+            # The value is added because the state may be zero. The state broadcasts against
+            # the stacked values of several stages.
             return jnp.abs(y) + jnp.abs(value)
 
         return {
@@ -99,14 +100,17 @@ class Stages(eqx.Module):
     def solve_blocks(
         self, solve: Callable, guess: Unknown, pending: Bool[Array, ""]
     ) -> tuple[Unknown, Bool[Array, ""]]:
-        """The unknown values of all blocks, one block after another, each with the values
-        of earlier blocks; and whether all blocks are solved. `solve` is called as
-        `solve(image, scale, guess, pending)` and returns these for one block."""
+        """Solves the blocks one after another, each with the values of earlier blocks.
+        Returns the unknown values of all blocks, and whether all blocks are solved. A path
+        that is not `pending` is left alone.
+
+        `solve(image, scale, guess, pending)` does the same for one block, of which `image`
+        is the function Phi, and `scale` is as the method `scale`."""
         known: KnownValues = {}
         unknown: Unknown = {}
         all_solved = jnp.array(True)
         for block in self.plan.blocks:
-            # Of an explicit block nothing is unknown.
+            # An explicit block has no unknown stages.
             if block.unknown:
                 solution, block_solved = self._solve_block(
                     block, known, solve, guess, pending
@@ -125,31 +129,18 @@ class Stages(eqx.Module):
         pending: Bool[Array, ""],
     ) -> tuple[Unknown, Bool[Array, ""]]:
         """The unknown values of one block, and whether they solve its equations."""
-        guess = {group: guess[group] for group in block.unknown}
-        # For values that are pairs (p, q), sweeps update all momenta, then all positions.
-        are_pairs = self.in_halves and all(map(_is_pair, guess.values()))
+        block_guess = {group: guess[group] for group in block.unknown}
 
-        def in_halves(values: Unknown) -> Any:
-            if not are_pairs:
-                return values
-            momenta = {group: p for group, (p, _) in values.items()}
-            positions = {group: q for group, (_, q) in values.items()}
-            return Halves(momenta, positions)
+        def block_image(unknown: Unknown) -> Unknown:
+            known_with_block = self._with_block(block, known, unknown)
+            return self._values(block.unknown, known_with_block)
 
-        def by_group(halves: Any) -> Unknown:
-            if not are_pairs:
-                return halves
-            return {group: (halves.p[group], halves.q[group]) for group in halves.p}
-
-        def image(halves: Any) -> Any:
-            known_with_block = self._with_block(block, known, by_group(halves))
-            return in_halves(self._values(block.unknown, known_with_block))
-
-        def scale(halves: Any) -> Any:
-            return in_halves(self.scale(by_group(halves)))
-
-        solution, is_solved = solve(image, scale, in_halves(guess), pending)
-        return by_group(solution), is_solved
+        are_pairs = all(map(_is_pair, block_guess.values()))
+        if self.in_halves and are_pairs:
+            return _solve_in_halves(
+                solve, block_image, self.scale, block_guess, pending
+            )
+        return solve(block_image, self.scale, block_guess, pending)
 
     def image(self, unknown: Unknown) -> Unknown:
         r"""The values $\Phi(k)$ that the stage equations of the whole step give to its
@@ -160,14 +151,14 @@ class Stages(eqx.Module):
         """The state at the end of the step, from the values of its unknown stages."""
         tableau = self.plan.tableau
         known = self._known(unknown, stores_shared=True)
-        return _position(self.y0, tableau.stages, tableau.weights[None], known)
+        return _states(self.y0, tableau.stages, tableau.weights[None], known)
 
     def _values(self, groups: Iterable[Group], known: KnownValues) -> Unknown:
-        """The values of these stages, at positions by the known ones."""
+        """The values of the stages in these groups, evaluated from the known values."""
         return {group: self._evaluate(group, known) for group in groups}
 
     def _known(self, unknown: Unknown, stores_shared: bool = False) -> KnownValues:
-        """The values of all stages, from those of the unknown ones."""
+        """The values of all stages, from the values of the unknown ones."""
         known: KnownValues = {}
         for block in self.plan.blocks:
             known = self._with_block(block, known, unknown, stores_shared)
@@ -180,52 +171,96 @@ class Stages(eqx.Module):
         unknown: Unknown,
         stores_shared: bool = False,
     ) -> KnownValues:
-        """`known` with all stages of a block added: its unknown stages have the values in
-        `unknown`, its explicit stages are evaluated from these. With `stores_shared`, an
-        explicit value that enters several positions is stored, so that XLA does not compute
-        it again for each."""
-        # Each `|` makes a new dictionary, and the caller's stays as it is: the root finder
+        """`known` with the values of all stages of a block added. The values of its unknown
+        stages are those in `unknown`; its explicit stages are evaluated. With
+        `stores_shared`, an explicit value that is used several times is stored, so that XLA
+        does not compute it again for each use. (Within an iteration of the root finder,
+        storing a value costs as much as computing it again.)"""
+        # Each `|` makes a new dictionary, and the caller's is not changed: the root finder
         # traces an iteration more than once, from the same known values.
         for group in block.unknown:
             known = known | _unstack(group, unknown[group])
-        # A row for each position, and one for the end; a column for each stage.
+        # Row `i` has the coefficients of the state of stage `i`, and the last row those of
+        # the end of the step. So column `j` shows where the value of stage `j` is used.
         tableau = self.plan.tableau
         coefficients = np.vstack([tableau.matrix, tableau.weights])
         for group in block.explicit:
             evaluate = ft.partial(self._evaluate, group, known)
             num_uses = np.count_nonzero(coefficients[:, list(group)].any(axis=1))
-            # Within an iteration, storing a value costs as much as computing it again.
             is_stored = stores_shared and num_uses > 1
             value = materialize(evaluate) if is_stored else evaluate()
             known = known | _unstack(group, value)
         return known
 
     def _evaluate(self, group: Group, known: KnownValues) -> _Value:
-        """The values of stages of one kind, stacked unless there is only one."""
+        """The values of the stages in a group, stacked unless there is only one."""
         tableau = self.plan.tableau
         rows = tableau.matrix[list(group)]
-        position = _position(self.y0, tableau.stages, rows, known)
+        states = _states(self.y0, tableau.stages, rows, known)
         stages = [tableau.stages[i] for i in group]
+        # The stages of a group have the same channels and write the same part of the state.
         first = stages[0]
 
-        def value(c: RealScalarLike, y: Y) -> _Value:
+        def value_at(c: RealScalarLike, y: Y) -> _Value:
             t = self.step.t0 + c * self.step.h
             changes = [self.step.changes[name](t, y) for name in first.channels]
             return _part(tree_sum(changes), first.writes)
 
         if len(stages) == 1:
-            return value(first.c, position)
+            return value_at(first.c, states)
         # `vmap` keeps the compiled code as small as for one evaluation.
         fractions = [stage.c for stage in stages]
         if len(set(fractions)) == 1:
             # With one time for all, what depends on time alone is computed once.
-            return jax.vmap(value, in_axes=(None, 0))(first.c, position)
-        times = jnp.asarray(fractions, jnp.result_type(self.step.h, float))
-        return jax.vmap(value)(times, position)
+            return jax.vmap(value_at, in_axes=(None, 0))(first.c, states)
+        c_of_stages = jnp.asarray(fractions, jnp.result_type(self.step.h, float))
+        return jax.vmap(value_at)(c_of_stages, states)
+
+
+def _solve_in_halves(
+    solve: Callable,
+    image: Callable[[Unknown], Unknown],
+    scale: Callable[[Unknown], Unknown],
+    guess: Unknown,
+    pending: Bool[Array, ""],
+) -> tuple[Unknown, Bool[Array, ""]]:
+    """`solve(image, scale, guess, pending)` for values that are pairs (p, q). `solve` gets
+    them as `Halves`, so that its sweeps update all momenta, then all positions."""
+
+    def halves_of(values: Unknown) -> Halves:
+        momenta = {group: p for group, (p, _) in values.items()}
+        positions = {group: q for group, (_, q) in values.items()}
+        return Halves(momenta, positions)
+
+    def pairs_of(halves: Halves) -> Unknown:
+        return {group: (halves.p[group], halves.q[group]) for group in halves.p}
+
+    def image_of_halves(halves: Halves) -> Halves:
+        return halves_of(image(pairs_of(halves)))
+
+    def scale_of_halves(halves: Halves) -> Halves:
+        return halves_of(scale(pairs_of(halves)))
+
+    halves, is_solved = solve(
+        image_of_halves, scale_of_halves, halves_of(guess), pending
+    )
+    return pairs_of(halves), is_solved
 
 
 def _is_pair(y: Y) -> bool:
     return type(y) is tuple and len(y) == 2
+
+
+# The number of operations that compute the two halves of a change one by one, divided by
+# the number that compute both together: 1 if the halves share no operation, 2 if they share
+# all. Above this ratio they are computed together, and sweeps update two copies of all
+# unknowns in turn. Such sweeps cost about the same and are fewer:
+#
+# - For a qubit under measurement (ratio 1.76) a step takes 24 evaluations in place of 44
+#   for one path, and 65 in place of 106 for the slowest of 1,024 paths.
+# - For amplitudes on four sites (1.77) and two damped spins (1.58) a step takes 0.63 to
+#   0.74 times as many sweeps, for h = 0.1 to 0.6.
+_LEAST_RATIO_TOGETHER = 1.5
 
 
 def _computes_halves_together(step: Step, y0: Y) -> bool:
@@ -242,17 +277,17 @@ def _computes_halves_together(step: Step, y0: Y) -> bool:
     # The results of the program are the leaves of the first half, then those of the second.
     first, _ = y0
     num_first = len(jtu.tree_leaves(first))
-    is_in_first = [number < num_first for number in range(len(program.outvars))]
+    num_second = len(program.outvars) - num_first
 
-    def operations_for(is_asked: list[bool]) -> int:
-        remaining, _ = dce_jaxpr(program, is_asked)
+    def operations_for(is_needed: list[bool]) -> int:
+        """The number of operations for the results that are needed."""
+        remaining, _ = dce_jaxpr(program, is_needed)
         return _num_operations(remaining)
 
-    one_by_one = operations_for(is_in_first) + operations_for(
-        [not x for x in is_in_first]
-    )
-    together = operations_for([True] * len(is_in_first))
-    return one_by_one > _LEAST_RATIO_TOGETHER * together
+    for_first = operations_for([True] * num_first + [False] * num_second)
+    for_second = operations_for([False] * num_first + [True] * num_second)
+    together = operations_for([True] * len(program.outvars))
+    return for_first + for_second > _LEAST_RATIO_TOGETHER * together
 
 
 def _num_operations(program: Jaxpr) -> int:
@@ -262,7 +297,7 @@ def _num_operations(program: Jaxpr) -> int:
 
 
 def _unstack(group: Group, value: _Value) -> KnownValues:
-    """The values of a group by stage number, from its stacked `value`."""
+    """The values of the stages in a group, by stage number, from its stacked `value`."""
     if len(group) == 1:
         (number,) = group
         return {number: value}
@@ -272,23 +307,24 @@ def _unstack(group: Group, value: _Value) -> KnownValues:
     }
 
 
-def _part(y: PyTree, part: str) -> PyTree:
-    """The state `y`, or for `"p"` or `"q"` its half of this name."""
-    if part == "y":
+def _part(y: PyTree, name: str) -> PyTree:
+    """The part of the state `y` with this name: all of it for `"y"`, its first half for
+    `"p"`, its second half for `"q"`."""
+    if name == "y":
         return y
     p, q = y
-    return p if part == "p" else q
+    return p if name == "p" else q
 
 
-def _position(
+def _states(
     y0: Y, stages: tuple[Stage, ...], rows: np.ndarray, known: KnownValues
 ) -> PyTree[Array]:
-    """`y0 + sum_i rows[:, i] known[i]`: a position for each of these rows of coefficients,
-    stacked unless there is only one. `known` may hold stages that these rows do not use,
-    with coefficients of zero; stages that are not in it count as zero."""
+    """The states `y0 + sum_i rows[:, i] known[i]`, one for each row of coefficients,
+    stacked unless there is only one row. A stage whose value is not in `known` counts as
+    zero."""
 
     def moved(part: str) -> PyTree[Array]:
-        """The state, or half of it, moved by the stages that write it."""
+        """This part of the states: the part of `y0`, moved by the stages that write it."""
         start = _part(y0, part)
         # Products with zero are left out here. XLA may not drop them: the product of zero
         # and infinity is NaN.
@@ -326,11 +362,6 @@ def _product(weights: np.ndarray, value: _Value) -> PyTree[Array]:
     return jtu.tree_map(products, value)
 
 
-# The outcome of the stage equations of a step, or of an earlier step that failed; `None`
-# for a solver without stage equations.
-Outcome: TypeAlias = optx.RESULTS | None
-
-
 def take_step(
     plan: StepPlan,
     step: Step,
@@ -338,8 +369,9 @@ def take_step(
     solver: diffrax.AbstractSolver,
     last_outcome: Outcome = None,
 ) -> tuple[Y, Outcome]:
-    """The end of the step, and whether its stage equations were solved, by the root finder
-    of `solver`. A path that failed before, by its `last_outcome`, is skipped."""
+    """The state at the end of the step, and the outcome. If there are stage equations, the
+    root finder of `solver` solves them; it skips paths whose `last_outcome` is a failure.
+    """
     if not any(block.unknown for block in plan.blocks):
         return Stages(plan, step, y0).end({}), last_outcome
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
@@ -354,7 +386,7 @@ def take_step(
 
 
 def no_failure() -> optx.RESULTS:
-    """The outcome before the first step, as arrays, since a loop carries it."""
+    """The outcome before the first step, with arrays as leaves, since a loop carries it."""
     return jtu.tree_map(jnp.asarray, optx.RESULTS.successful)
 
 
@@ -372,7 +404,7 @@ def result_of(outcome: Outcome, y1: Y) -> diffrax.RESULTS:
     return R.where(_failed(outcome), R.promote(outcome), result)
 
 
-# Diffrax traces a step three times or more. Under `filter_jit` that is done once.
+# Diffrax traces a step three times or more. `filter_jit` traces this function only once.
 @eqx.filter_jit
 def _jitted_implicit_step(
     plan: StepPlan,
@@ -382,10 +414,10 @@ def _jitted_implicit_step(
     finder: Any,
     max_steps: int,
 ) -> tuple[Y, optx.RESULTS]:
-    """The end of the step, and whether its stage equations were solved."""
-    # The arrays that the functions of the step capture become leaves of a PyTree, so that
-    # derivatives with respect to these are seen. Converted functions accept only the types
-    # that they were traced for.
+    """The state at the end of the step, and the outcome."""
+    # `filter_closure_convert` makes the arrays that a function captures leaves of a PyTree,
+    # so that `_implicit_step` sees derivatives with respect to them. A converted function
+    # accepts only the types that it was converted for, so `t0` and `h` get theirs first.
     dtype = jnp.result_type(step.t0, step.h, float)
     t0 = jnp.asarray(step.t0, dtype)
     h = jnp.asarray(step.h, dtype)
@@ -406,9 +438,9 @@ def _jitted_implicit_step(
 def _implicit_step(
     stages: Stages, last_outcome: optx.RESULTS, *, finder: Any, max_steps: int
 ) -> tuple[Y, Unknown, optx.RESULTS]:
-    """The end of the step, the values of its unknown stages, and whether they solve the
-    stage equations. A path that failed before keeps its `last_outcome`, and the root finder
-    spends no time on it."""
+    """The state at the end of the step, the values of its unknown stages, and the outcome.
+    A path that failed before keeps its `last_outcome`, and the root finder spends no time
+    on it."""
     if isinstance(finder, optx.BestSoFarRootFinder):
         raise ValueError(
             "`BestSoFarRootFinder` returns an iterate from before the last correction, "
@@ -419,8 +451,12 @@ def _implicit_step(
     guess, failed_before = batched_like((stages.zeros(), failed_before), inputs)
     # With NaN as the guess, the root finder stops at once for a path that failed before.
     guess = jtu.tree_map(lambda k: jnp.where(failed_before, jnp.nan, k), guess)
+
+    def residual(k: Unknown, stages: Stages) -> Unknown:
+        return (k**ω - stages.image(k) ** ω).ω
+
     sol = optx.root_find(
-        lambda k, stages: (k**ω - stages.image(k) ** ω).ω,
+        residual,
         finder,
         guess,
         args=stages,
@@ -440,33 +476,37 @@ def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
     y1, unknown, result = _implicit_step(
         stages, last_outcome, finder=finder, max_steps=max_steps
     )
-    # Without a solution there is no derivative. It is set to zero, so that a failed path
-    # does not spoil gradients that are summed over a batch.
+    # Without a solution there is no derivative. It is taken at k = 0, and set to zero, so
+    # that a failed path does not spoil gradients that are summed over a batch.
     failed = _failed(result) | ~all_finite(y1)
     root = jtu.tree_map(lambda k: jnp.where(failed, 0, k), unknown)
+    constants, variables = _constants_and_variables(stages, t_stages)
 
-    # A leaf that is not differentiated has the tangent `None`, which `jax.jvp` does not
-    # take.
-    has_no_tangent = jtu.tree_map(_is_none, t_stages, is_leaf=_is_none)
-    constants, variables = eqx.partition(stages, has_no_tangent, is_leaf=_is_none)
-
-    def image(variables: Stages) -> Unknown:
+    def image_of_root(variables: Stages) -> Unknown:
         return eqx.combine(variables, constants).image(root)
 
-    def end(variables: Stages, unknown: Unknown) -> Y:
+    def end_of_step(variables: Stages, unknown: Unknown) -> Y:
         return eqx.combine(variables, constants).end(unknown)
 
-    # The unknown values k satisfy k = Phi(k, x) with the variables x. So their tangents
+    # The unknown values k satisfy k = Phi(k, x), where x are the variables. So the tangents
     # satisfy dk = (dPhi / dk) dk + (dPhi / dx) dx.
-    _, rhs = jax.jvp(image, (variables,), (t_stages,))
+    _, rhs = jax.jvp(image_of_root, (variables,), (t_stages,))
     _, linear = jax.linearize(stages.image, root)
     # The linear solver of a root finder, as in `PicardNewton` and `optx.Newton`, serves for
     # derivatives, too. Others (`optx.FixedPointIteration`, `optx.Dogleg`) have none.
-    t_unknown = differentiate(getattr(finder, "linear_solver", None), linear, rhs)
-    _, t_y1 = jax.jvp(end, (variables, root), (t_stages, t_unknown))
+    linear_solver = getattr(finder, "linear_solver", None)
+    t_unknown = differentiate(linear_solver, linear, rhs)
+    _, t_y1 = jax.jvp(end_of_step, (variables, root), (t_stages, t_unknown))
     t_y1, t_unknown = jtu.tree_map(lambda t: jnp.where(failed, 0, t), (t_y1, t_unknown))
     t_result = jtu.tree_map(lambda _: None, result)
     return (y1, unknown, result), (t_y1, t_unknown, t_result)
+
+
+def _constants_and_variables(stages: Stages, t_stages: Stages) -> tuple[Stages, Stages]:
+    """The leaves of `stages` that are not differentiated, and the leaves that are. A leaf
+    that is not differentiated has the tangent `None`, which `jax.jvp` does not take."""
+    is_constant = jtu.tree_map(_is_none, t_stages, is_leaf=_is_none)
+    return eqx.partition(stages, is_constant)
 
 
 def _is_none(x: Any) -> bool:

@@ -13,9 +13,8 @@ from .._custom_types import RealScalarLike
 from .._terms import brownian_paths
 
 
-# A step has at least so many units in the last place (ulps) of the times between which a
-# solve goes. Diffrax sees to it for the last step: it merges a shorter remainder into the
-# step before.
+# The least length of a step, in units in the last place (ulps) of the times of the solve.
+# At the end of a solve Diffrax merges a shorter remainder into the step before.
 _LEAST_ULPS = 100
 _OUTSIDE = (
     "A step begins before `path.t0` or ends after `path.t1` of a Brownian path, which has "
@@ -41,8 +40,9 @@ def result_with_times_checked(
     t1: RealScalarLike,
     result: diffrax.RESULTS,
 ) -> diffrax.RESULTS:
-    """The `result` of the step from `t0` to `t1`, or `RESULTS.dt_min_reached` if it is too
-    short for the rounding of times. An error when run if a path does not cover the step."""
+    """The `result` of the step from `t0` to `t1`, or `RESULTS.dt_min_reached` if the step
+    is too short for the rounding of times. If a Brownian path does not cover the step, that
+    is an error when run."""
     R: Any = diffrax.RESULTS
     t0 = jnp.asarray(t0)
     t1 = jnp.asarray(t1)
@@ -52,8 +52,8 @@ def result_with_times_checked(
     is_too_short = h < _LEAST_ULPS * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     result = R.where(is_too_short, R.dt_min_reached, result)
     for path in brownian_paths(terms):
-        # Most paths have no ends, so that nothing needs to be checked when run. Ends that
-        # are traced arrays cannot be compared here.
+        # Most paths have no ends, and need no check when run. Ends that are traced arrays
+        # cannot be compared here.
         are_known = isinstance(path.t0, float) and isinstance(path.t1, float)
         if are_known and path.t0 == -np.inf and path.t1 == np.inf:
             continue
