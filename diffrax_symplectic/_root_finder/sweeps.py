@@ -1,4 +1,12 @@
-"""Sweeps: the iteration that usually solves a step, for all paths of a batch together."""
+r"""Sweeps: the iteration that usually solves a step, for all paths of a batch together.
+
+A sweep updates the momenta by a fixed-point iteration, then the positions with the new
+momenta. Convergence checks take much of the time of small systems, so there are few: each
+check tells how many sweeps come before the next one.
+
+Unknowns that are not momenta and positions are doubled: $y = \Phi(y)$ becomes $p =
+\Phi(q)$, $q = \Phi(p)$, with two halves $p$ and $q$ that agree at the solution.
+"""
 
 import functools as ft
 from collections.abc import Callable
@@ -22,8 +30,8 @@ Map: TypeAlias = Callable[[PyTree[Array]], PyTree[Array]]
 # 60^6 is beyond the 1e8 of single precision.
 _FIRST_IN_DOUBLE = 9
 _FIRST_IN_SINGLE = 6
-# The same for a doubled system (y = \Phi(y) as p = \Phi(q), q = \Phi(p)), where fewer
-# sweeps suffice, since each evaluates everything twice.
+# The same for a doubled system. Fewer sweeps suffice, since each evaluates everything
+# twice.
 _FIRST_DOUBLED_IN_DOUBLE = 6
 _FIRST_DOUBLED_IN_SINGLE = 5
 # The most sweeps between two convergence checks: rates near one are not known accurately.
@@ -33,11 +41,12 @@ _MOST_AT_ROUNDING = 3
 # Sweeps with a slower rate of convergence are under-relaxed. Faster ones would gain less
 # than one sweep.
 SLOW = 0.3
-# The relaxation factor after divergence, which is optimal for a rate of 8:
-# 2 / (1 + sqrt(1 + 8)).
+# The relaxation factor after divergence. It is the best one for sweeps whose corrections
+# grow by a factor of 8: 2 / (1 + sqrt(1 + 8)).
 _STRONGEST_RELAXATION = 0.5
-# The base-2 logarithm of the rate expected of relaxed sweeps, a quarter. By Young's formula
-# the rate is 0.17 or better for rates up to one, but only after the first few sweeps.
+# The base-2 logarithm of a quarter, the rate expected of relaxed sweeps. By Young's formula
+# relaxed sweeps converge at a rate of 0.17 or better if the rate without relaxation is one
+# or less. The first few converge more slowly.
 _LOG2_RELAXED_RATE = -2.0
 # The base-2 logarithm of 0.87, the rate above which sweeps count as not converging.
 LOG2_STALLED = -0.2
@@ -58,12 +67,11 @@ class _SweepState(NamedTuple):
     - `relaxation`: the relaxation factor.
     - `log2_size`: the base-2 logarithm of the size of the last correction, in units of the
         tolerance.
-    - `is_solved`: whether the last correction of the path, while it was pending, was small
-        enough.
-    - `pending`: whether to continue.
-    - `num_done`: the number of sweeps so far, shared by all paths of the batch.
-    - `num_ahead`: the number of sweeps until the next check, shared by them; zero at the
-        end.
+    - `is_solved`: whether the path has converged.
+    - `pending`: whether the path needs further sweeps, and they may help.
+    - `num_done`: the number of sweeps so far, the same for all paths of the batch.
+    - `num_ahead`: the number of sweeps until the next check, the same for all paths; zero
+        once no path is pending.
     """
 
     y: Halves | None
@@ -89,16 +97,16 @@ def solve_by_sweeps(
 
     In a sweep $q$ is updated with the new $p$ (Gauss--Seidel). For an oscillating
     Hamiltonian system this reduces the error as much as two evaluations of both halves, for
-    the cost of one if $H = T(p) + V(q)$. Unknowns other than `Halves` are iterated by
-    Gauss--Seidel on the doubled system.
+    the cost of one if $H = T(p) + V(q)$.
 
-    Each convergence check measures the rate at which corrections shrink, and from it the
-    number of sweeps that the slowest path needs before the next check. For an oscillation a
-    rate $a$ belongs to an eigenvalue $-a$. With the relaxation factor $\omega = 2 / (1 +
-    \sqrt{1 + a})$ sweeps then converge at the rate $1 - \omega$ (D. M. Young, Transactions
-    of the American Mathematical Society 76, 1954, 92-111; for doubled systems G. H. Golub
-    and R. S. Varga, Numerische Mathematik 3, 1961, 147-156). Sweeps that diverged are
-    started again with strong under-relaxation.
+    Each convergence check (see `_decide`) measures the rate at which corrections shrink.
+    From the rate follow the number of sweeps that the slowest path needs before the next
+    check, and once, after the first check, the relaxation factor: for an oscillation, a
+    rate $a$ belongs to an eigenvalue $-a$, and with the factor $\omega = 2 / (1 + \sqrt{1 +
+    a})$ sweeps converge at the rate $1 - \omega$ (D. M. Young, Transactions of the American
+    Mathematical Society 76, 1954, 92-111; for doubled systems G. H. Golub and R. S. Varga,
+    Numerische Mathematik 3, 1961, 147-156). Sweeps that diverged are started again with
+    strong under-relaxation.
     """
     in_halves = isinstance(guess, Halves)
     start = guess if in_halves else Halves(guess, guess)
@@ -111,26 +119,26 @@ def solve_by_sweeps(
             _FIRST_DOUBLED_IN_SINGLE if in_single else _FIRST_DOUBLED_IN_DOUBLE
         )
 
-    # The halves of a doubled system agree in the end.
-    def value_of(y: PyTree[Array]) -> PyTree[Array]:
+    def value_of(y: Halves) -> PyTree[Array]:
+        """The unknowns. For a doubled system either half would do."""
         return y if in_halves else y.q
 
     def sweep_and_check(state: _SweepState) -> _SweepState:
         correction, y = _sweep_until_check(image, state, in_halves)
         size = tolerance.measure(correction, scale(value_of(y)))
-        # Before the first check there is no correction to compare with, and `log2_size` is
-        # infinite: the size of the state takes its place.
+        # The first check has no earlier correction to compare with: `state.log2_size` is
+        # infinite. The size of the state takes its place.
         last_log2_size = jnp.minimum(state.log2_size, log2(size.size_of_state))
         log2_size = log2(size.size)
         check = ft.partial(
             _decide, state, log2_size, last_log2_size, size, first_sweeps, max_sweeps
         )
-        # Without `materialize` the result would be recomputed wherever it is used: steps of
-        # small systems took 1.3 to 2.8 times as long. The logarithms are inside, so that
-        # only one kernel reads them: otherwise ten arrays took 1.1 times as long.
+        # Without `materialize` XLA would compute the decision again wherever it is used:
+        # steps of small systems took 1.3 to 2.8 times as long.
         next_state, goes_back = materialize(check)
 
-        # All paths of a batch sweep together, but a path that has ended stays where it was.
+        # All paths of a batch sweep together. A path that is no longer pending keeps its
+        # iterate.
         def next_iterate(new: Array, guess: Array, old: Array) -> Array:
             return jnp.where(state.pending, jnp.where(goes_back, guess, new), old)
 
@@ -139,8 +147,8 @@ def solve_by_sweeps(
     one = jnp.ones((), dtype)
     inf = jnp.full((), jnp.inf, dtype)
     false = jnp.array(False)
-    # The check batches these values in any case. If they were not batched here, JAX would
-    # trace the loop again to find that out.
+    # After a check each path of a batch has its own values of these. JAX would trace the
+    # loop a second time if they were not batched from the beginning.
     initial_values = (start, pending, one, inf, false)
     start, pending, one, inf, false = batched_like(initial_values, guess)
     state = _SweepState(
@@ -149,7 +157,7 @@ def solve_by_sweeps(
         log2_size=inf,
         is_solved=false,
         pending=pending,
-        # The batch shares the counts, so that the loops keep unbatched lengths.
+        # These two are the same for all paths, so that loops have one length for all.
         num_done=0,
         num_ahead=first_sweeps,
     )
@@ -160,11 +168,11 @@ def solve_by_sweeps(
 def _sweep_until_check(
     image: Map, state: _SweepState, in_halves: bool
 ) -> tuple[PyTree[Array], Halves]:
-    """The last correction of all sweeps until the next check, and the iterate after
-    them."""
+    """Makes the sweeps until the next check. Returns the correction by the last of them,
+    and the iterate after it."""
 
-    # Each half is taken from an evaluation of its own. XLA drops what an evaluation
-    # computes for the other half.
+    # Each half has an evaluation of its own, from which XLA drops what only the other half
+    # needs.
     def new_p(y: Halves) -> PyTree[Array]:
         return image(y).p if in_halves else image(y.q)
 
@@ -184,8 +192,9 @@ def _sweep_until_check(
 
     if not in_halves:
         y = lax.fori_loop(0, state.num_ahead, sweep, state.y)
-        # The halves may converge to different solutions of y = \Phi(\Phi(y)), which do not
-        # solve y = \Phi(y). Only their difference shows that: it serves as the correction.
+        # The halves may converge to two different solutions of y = \Phi(\Phi(y)), neither
+        # of which solves y = \Phi(y). Their difference shows that, so it serves as the
+        # correction.
         return (y.q**ω - y.p**ω).ω, y
     # A loop that also carried the previous iterate would copy it in each sweep: steps of 64
     # pairs took 1.1 to 1.4 times as long, although the program was a tenth shorter.
@@ -202,31 +211,38 @@ def _decide(
     first_sweeps: int,
     max_sweeps: int,
 ) -> tuple[_SweepState, Bool[Array, ""]]:
-    """The next state, except for the iterate, and whether to go back to the guess, after a
-    correction of this `size`, whose base-2 logarithm is `log2_size`. The correction at the
-    last check had the logarithm `last_log2_size`. `first_sweeps` is the number of sweeps
-    before the first check, and `max_sweeps` the most in all."""
-    # The rate is the factor by which a correction shrinks in one sweep. In logarithms it is
-    # a difference per sweep, and the number of further sweeps is a quotient.
+    """A convergence check: decides from the size of the last correction how a path goes on.
+    Returns the next state, with `None` for the iterate, and whether the path goes back to
+    its guess.
+
+    - `log2_size`, `last_log2_size`: the base-2 logarithms of the sizes of the corrections
+        at this check and at the one before.
+    - `size`: the size of the correction at this check.
+    - `first_sweeps`, `max_sweeps`: the number of sweeps before the first check, and the
+        most in all.
+    """
+    # The rate is the factor by which a correction shrinks in one sweep. With logarithms its
+    # powers are products.
     log2_rate = (log2_size - last_log2_size) / state.num_ahead
     num_done = state.num_done + state.num_ahead
     has_stalled = log2_rate >= LOG2_STALLED
     has_converged = converged(log2_size, log2_rate, size.is_rounding, has_stalled)
-    # Sweeps that diverged get one more try. If it stalls, Newton's method takes over.
+    # Sweeps that do not converge are started again, once, with the strongest relaxation. If
+    # those do not converge either, Newton's method takes over.
     starts_again = has_stalled & (state.relaxation > _STRONGEST_RELAXATION)
     rate = jnp.exp2(log2_rate)
-    # The relaxation is tuned once, at the first check: later rates are those of relaxed
-    # sweeps, to which the formula does not apply.
+    # The relaxation is tuned once, at the first check. The formula does not apply to the
+    # rates of relaxed sweeps.
     is_tuned_now = (state.num_done == 0) & (rate > SLOW) & ~has_stalled
     # After so many more sweeps, `log2_size` has come down to `-LOG2_MARGIN`.
     num_needed = (log2_size + LOG2_MARGIN) / jnp.where(
         is_tuned_now, -_LOG2_RELAXED_RATE, -log2_rate
     )
-    # Sweeps that would not end in time end now, before they cost anything.
+    # A path that would need too many sweeps ends now, so that the batch does not wait.
     in_time = starts_again | (~has_stalled & (num_done + num_needed < max_sweeps))
     pending = state.pending & ~has_converged & in_time & (num_done < max_sweeps)
-    # Newton's method begins where the sweeps ended if that is near a solution, or else at
-    # the guess. Paths that sweep on keep their iterate, too.
+    # Newton's method begins where the sweeps ended if that is near a solution, and
+    # otherwise at the guess.
     keeps_iterate = ~has_stalled & (size.is_small | pending)
     num_ahead = jnp.where(starts_again, first_sweeps, num_needed)
     # Corrections as small as rounding errors show no rate.
