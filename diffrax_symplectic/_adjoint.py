@@ -93,7 +93,8 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
             )
         check_unconstrained(terms, "ReversingAdjoint")
         _check_supported(solver, stepsize_controller, event, saveat)
-        # Each step of the backward pass recomputes the solver state (see `made_jump`).
+        # No derivatives pass through the solver state, which each step of the backward pass
+        # computes anew.
         kwargs |= dict(
             stepsize_controller=stepsize_controller,
             saveat=saveat,
@@ -120,15 +121,13 @@ ReversingAdjoint.__init__.__doc__ = """**Arguments:**
 def _check_supported(
     solver: Any, controller: Any, event: diffrax.Event | None, saveat: diffrax.SaveAt
 ) -> None:
-    """Raises a `ValueError` for solves that the backward pass does not know how to
-    undo."""
-    known_steps = diffrax.ConstantStepSize | diffrax.StepTo
+    """Raises a `ValueError` for a solve that the backward pass cannot undo."""
     if not _undoes_its_steps(solver):
         fault = (
             "needs a reversible solver, such as `ImplicitMidpoint`, `StormerVerlet` or "
             f"`StrangGauss`; got `{type(solver).__name__}`"
         )
-    elif not isinstance(controller, known_steps):
+    elif not isinstance(controller, diffrax.ConstantStepSize | diffrax.StepTo):
         fault = (
             "needs steps that are known in advance: `stepsize_controller=diffrax."
             "ConstantStepSize()` or `diffrax.StepTo(ts)`; got "
@@ -150,9 +149,9 @@ def _check_supported(
 
 
 def _saves_states_alone(saveat: diffrax.SaveAt) -> bool:
-    """Whether states are saved at the end or at given times, and nothing else is."""
+    """Whether a solve saves states at the end or at given times, and nothing else."""
     sub_saveat = saveat.subs
-    # Several of them would be a PyTree.
+    # With several `SubSaveAt`, `subs` is a PyTree of them.
     if saveat.dense or not isinstance(sub_saveat, diffrax.SubSaveAt):
         return False
     saves_both = sub_saveat.t1 and sub_saveat.ts is not None
@@ -161,13 +160,13 @@ def _saves_states_alone(saveat: diffrax.SaveAt) -> bool:
 
 
 def _undoes_its_steps(solver: Any) -> bool:
-    """Whether a step with negated increments leads back to where a step began, which is
-    known for solvers of this package only."""
+    """Whether a step with negated increments leads from the end of a step back to its
+    start. This is known only for solvers of this package."""
     return is_solver(solver) and solver.undoes_its_steps
 
 
-# Equinox passes to the rules below what is passed here, in the same way: `inputs` are
-# differentiated, keyword arguments are not.
+# Equinox calls the rules for the forward and the backward pass below with the same
+# arguments: `inputs` are differentiated, keyword arguments are not.
 @eqx.filter_custom_vjp
 def _solve(inputs, *, adjoint, throw, **kwargs):
     del throw
@@ -175,8 +174,9 @@ def _solve(inputs, *, adjoint, throw, **kwargs):
 
 
 def _run(adjoint: ReversingAdjoint, inputs: Any, outer_while_loop: Callable, kwargs):
-    """The final state of Diffrax's loop, and statistics. `inputs` are differentiated:
-    state, `args`, terms and solver. `kwargs` are the other arguments of `loop`."""
+    """The final state of Diffrax's loop, and statistics. `inputs` are what is
+    differentiated: the initial state, `args`, terms and solver. `kwargs` are the other
+    arguments of `loop`."""
     y, args, terms, solver = inputs
     init_state = with_y(kwargs["init_state"], y)
     kwargs = kwargs | {"init_state": init_state}
@@ -188,10 +188,10 @@ def _run(adjoint: ReversingAdjoint, inputs: Any, outer_while_loop: Callable, kwa
 class _Residuals(NamedTuple):
     """What the forward pass leaves for the backward pass.
 
-    - `checkpoints`: the saved states, evenly spaced over the steps, along the first axis.
+    - `checkpoints`: states at evenly spaced steps, along the first axis.
     - `y1`: the state at the end.
     - `num_steps`: the number of steps made.
-    - `num_saved`: the number of saved times.
+    - `num_saved`: the number of times of `SaveAt(ts=...)`.
     """
 
     checkpoints: PyTree[Array]
@@ -205,9 +205,11 @@ def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
     del perturbed, throw
     times = StepTimes(kwargs["stepsize_controller"], kwargs["init_state"])
     steps_between = _steps_between(times, adjoint.checkpoints)
-    checkpoints_of_loop = []
+    # Set by `recording_while_loop`, since Diffrax returns only its own state.
+    checkpoints = None
 
     def recording_while_loop(cond_fun, body_fun, init_val, **options):
+        nonlocal checkpoints
         final, checkpoints = _while_loop_with_checkpoints(
             adjoint.checkpoints,
             steps_between,
@@ -216,14 +218,11 @@ def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
             init_val,
             **options,
         )
-        # Diffrax returns only its own state, so the checkpoints leave by this list.
-        checkpoints_of_loop.append(checkpoints)
         return final
 
     out = _run(adjoint, inputs, recording_while_loop, kwargs)
     final_state, _ = out
     final = solve_state(final_state)
-    [checkpoints] = checkpoints_of_loop
     return out, _Residuals(
         checkpoints=checkpoints,
         y1=final.y,
@@ -233,7 +232,7 @@ def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
 
 
 def _steps_between(times: StepTimes, num_checkpoints: int) -> IntScalarLike:
-    """The number of steps between two checkpoints."""
+    """The number of steps from one checkpoint to the next."""
     # The quotient is rounded up, so that the checkpoints suffice for all steps.
     return jnp.maximum(1, -(-jnp.asarray(times.num_steps()) // num_checkpoints))
 
@@ -248,8 +247,8 @@ def _while_loop_with_checkpoints(
     buffers: Callable,
     **options,
 ) -> tuple[Any, PyTree[Array]]:
-    """Diffrax's loop over steps, which also carries the checkpoints, a row for each: its
-    final state, and the checkpoints."""
+    """Runs Diffrax's loop over steps. Returns the final state of the loop, and the states
+    at every `steps_between` steps, along a first axis of length `num_checkpoints`."""
 
     def empty_rows(x: Array) -> Array:
         return jnp.zeros((num_checkpoints, *jnp.shape(x)), x.dtype)
@@ -262,7 +261,7 @@ def _while_loop_with_checkpoints(
         state, rows = carry
         before_step = solve_state(state)
         row, rest = jnp.divmod(before_step.num_steps, steps_between)
-        # States between checkpoints go to the row after the last one, which `save` drops.
+        # For states between checkpoints the row is out of range, so that `save` drops them.
         row = jnp.where(rest == 0, row, num_checkpoints)
 
         def save(x: Array, saved: Array) -> Array:
@@ -270,6 +269,7 @@ def _while_loop_with_checkpoints(
 
         return body_fun(state), jtu.tree_map(save, before_step.y, rows)
 
+    # `buffers` tells which arrays of Diffrax's state the loop writes in place.
     def buffers_of_state(carry):
         state, _ = carry
         return buffers(state)
@@ -290,12 +290,12 @@ class _Walk(NamedTuple):
     """The state of the backward pass.
 
     - `i`: the number of steps from the start.
-    - `y`: the state there.
-    - `a_y`, `a_parameters`: the derivatives of the loss with respect to this state, and to
-        the parameters so far.
-    - `num_saved`: the number of saved times before this one.
-    - `size`: the largest entry of this state, or of a later one with a discount for each
-        step between.
+    - `y`: the state after these steps.
+    - `a_y`: with respect to `y`, without the effect on the first `num_saved` saved states.
+    - `a_parameters`: with respect to the parameters, through the steps after `y`.
+    - `num_saved`: the number of saved states up to the time of `y`.
+    - `size`: the largest entry of `y`, or if it is larger, `_SIZE_KEPT_PER_STEP` times the
+        size of the next state.
     - `agrees`: whether the pass agreed with all checkpoints so far.
     """
 
@@ -312,123 +312,164 @@ class _Walk(NamedTuple):
 def _solve_bwd(
     residuals: _Residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwargs
 ):
-    checkpoints, y1, num_steps, num_saved = residuals
-    ts = kwargs["saveat"].subs.ts
     times = StepTimes(kwargs["stepsize_controller"], kwargs["init_state"])
     steps_between = _steps_between(times, adjoint.checkpoints)
+    solver_state = times.solver_state()
+    a_final_state, _ = grad_out
+    ts = kwargs["saveat"].subs.ts
+    a_ys = _with_zeros(solve_state(a_final_state).ys, residuals.y1, ts)
+    saved = _SavedStates(ts, a_ys)
+    # The parameters are `args`, terms and solver.
     _, *parameters = inputs
     _, *is_perturbed = perturbed
     diff, nondiff = eqx.partition(parameters, is_perturbed)
-    step = ft.partial(_step_of_solve, times, nondiff)
-    final_grad, _ = grad_out
-    num_times = 1 if ts is None else len(ts)
-    a_ys = _with_zeros(solve_state(final_grad).ys, y1, num_times)
+    args, terms, solver = parameters
+    parameters_back = (args, reversed_in_time(terms), solver)
 
     def is_going(walk: _Walk) -> Bool[Array, ""]:
         return walk.i > 0
 
     def step_back(walk: _Walk) -> _Walk:
         i = walk.i - 1
-        y_found = step(walk.y, diff, i, back=True)
+        t0 = times.time(i)
+        t1 = times.time(i + 1)
+
+        def step(y0: Y, diff: PyTree[Array]) -> Y:
+            parameters = eqx.combine(diff, nondiff)
+            return _y_after_step(parameters, t0, t1, y0, solver_state)
+
+        y_found = _y_after_step(parameters_back, -t1, -t0, walk.y, solver_state)
         size = jnp.maximum(optx.max_norm(y_found), _SIZE_KEPT_PER_STEP * walk.size)
-        y, agrees = _meet_checkpoint(
-            y_found, checkpoints, i, steps_between, walk.agrees, size
+        y0, agrees = _meet_checkpoint(
+            y_found, residuals.checkpoints, i, steps_between, walk.agrees, size
         )
-        cotangents = _StepCotangents(
-            a_y1=walk.a_y,
-            a_y0=jtu.tree_map(jnp.zeros_like, walk.a_y),
-            num_saved=walk.num_saved,
-        )
-        if ts is not None:
-            t0 = times.time(i)
-            t1 = times.time(i + 1)
-            cotangents = _with_saved_cotangents(t0, t1, ts, a_ys, cotangents)
         # The step is made forward again, from the state that was found, so that its
         # transposed Jacobian is exact.
-        forward = ft.partial(step, i=i, back=False)
-        _, vjp = jax.vjp(forward, y, diff)
-        a_y_through_step, a_parameters_of_step = vjp(cotangents.a_y1)
+        _, vjp = jax.vjp(step, y0, diff)
+        ends = saved.added_in_step(t0, t1, walk.a_y, walk.num_saved)
+        a_y0_through_step, a_parameters_of_step = vjp(ends.a_y1)
         return _Walk(
             i=i,
-            y=y,
+            y=y0,
+            a_y=(ends.a_y0**ω + a_y0_through_step**ω).ω,
             a_parameters=(walk.a_parameters**ω + a_parameters_of_step**ω).ω,
-            a_y=(cotangents.a_y0**ω + a_y_through_step**ω).ω,
-            num_saved=cotangents.num_saved,
+            num_saved=ends.num_saved,
             size=size,
             agrees=agrees,
         )
 
-    if ts is None:
-        a_y1 = jtu.tree_map(lambda rows: rows[-1], a_ys)
-    else:
-        # States that were saved at the end, too, are added in the first step back, as all
-        # that were saved after the start of that step.
-        a_y1 = jtu.tree_map(lambda rows: jnp.zeros_like(rows[0]), a_ys)
-    walk = _Walk(
-        i=jnp.asarray(num_steps),
-        y=y1,
-        a_y=a_y1,
+    end = _Walk(
+        i=jnp.asarray(residuals.num_steps),
+        y=residuals.y1,
+        a_y=saved.at_end(),
         a_parameters=jtu.tree_map(jnp.zeros_like, diff),
-        num_saved=jnp.asarray(num_saved),
-        size=optx.max_norm(y1),
+        num_saved=jnp.asarray(residuals.num_saved),
+        size=optx.max_norm(residuals.y1),
         agrees=jnp.array(True),
     )
-    walk = lax.while_loop(is_going, step_back, walk)
-    a_y0 = walk.a_y
-    if ts is not None:
-        # Each step back passes the times after its start, so that those of states saved at
-        # the start of the solve are left.
-        is_at_start = jnp.arange(len(ts)) < walk.num_saved
-
-        def with_saved_at_start(a: Array, rows: Array) -> Array:
-            return a + jnp.tensordot(is_at_start, rows, 1)
-
-        a_y0 = jtu.tree_map(with_saved_at_start, a_y0, a_ys)
-    return _checked_gradients(walk.agrees, throw, (a_y0, *walk.a_parameters))
+    start = lax.while_loop(is_going, step_back, end)
+    a_y = saved.added_at_start(start.a_y, start.num_saved)
+    return _checked_gradients(start.agrees, throw, (a_y, *start.a_parameters))
 
 
-def _step_of_solve(
-    times: StepTimes,
-    nondiff: PyTree,
-    y: Y,
-    diff: PyTree[Array],
-    i: IntScalarLike,
-    back: bool,
-) -> Y:
-    """The state after one step from `y` between the times of steps `i` and `i + 1`, forward
-    or back. `diff` and `nondiff` are the two parts of `args`, terms and solver: what is
-    differentiated, and everything else."""
-    args, terms, solver = eqx.combine(diff, nondiff)
-    t0 = times.time(i)
-    t1 = times.time(i + 1)
-    if back:
-        begin = -t1
-        end = -t0
-        terms = reversed_in_time(terms)
-    else:
-        begin = t0
-        end = t1
+def _y_after_step(parameters: PyTree, t0: Any, t1: Any, y0: Y, solver_state: Any) -> Y:
+    """The state after one step of the solve."""
+    args, terms, solver = parameters
     # The solver state belongs to another step, so the step is made as after a jump.
-    made_jump = True
-    solver_state = times.solver_state()
-    y1, *_ = solver.step(terms, begin, end, y, args, solver_state, made_jump)
+    y1, *_ = solver.step(terms, t0, t1, y0, args, solver_state, made_jump=True)
     return y1
 
 
-def _with_zeros(grad_ys: PyTree[Array | None], y1: Y, num_times: int) -> PyTree[Array]:
-    """The derivatives of the loss with respect to the states at all saved times, with zeros
-    in place of `None`, which JAX gives where the loss does not depend on a leaf."""
+def _with_zeros(a_ys: PyTree[Array | None], y1: Y, ts: Array | None) -> PyTree[Array]:
+    """`a_ys`, the derivatives with respect to the saved states, with zeros in place of
+    `None`, which JAX passes where the loss does not depend on a leaf. `y1` is one of the
+    states, and `ts` are the times."""
+    num_times = 1 if ts is None else len(ts)
 
-    def or_zeros(y1_leaf: Array, grad: Array | None) -> Array:
-        if grad is None:
+    def or_zeros(y1_leaf: Array, a_leaf: Array | None) -> Array:
+        if a_leaf is None:
             return jnp.zeros((num_times, *jnp.shape(y1_leaf)), y1_leaf.dtype)
-        return grad
+        return a_leaf
 
-    return jtu.tree_map(or_zeros, y1, grad_ys, is_leaf=lambda x: x is None)
+    return jtu.tree_map(or_zeros, y1, a_ys, is_leaf=lambda x: x is None)
 
 
-# The fraction of its size that a state passes to the one before it. Thus a start at rest,
-# which weak increments may not leave for dozens of steps, gets the size of later states.
+class _StepEnds(NamedTuple):
+    """Derivatives of the loss with respect to the states at both ends of a step.
+
+    - `a_y1`: with respect to the state at the end of the step.
+    - `a_y0`: with respect to the state at the start, but not through the state at the end.
+    - `num_saved`: the number of saved states that are not in the derivatives yet.
+    """
+
+    a_y1: Y
+    a_y0: Y
+    num_saved: Array
+
+
+class _SavedStates(NamedTuple):
+    """Derivatives of the loss with respect to the saved states.
+
+    - `ts`: the times of the states. `None` if only the state at the end is saved.
+    - `a_ys`: the derivatives, along the first axis.
+    """
+
+    ts: Array | None
+    a_ys: PyTree[Array]
+
+    def at_end(self) -> Y:
+        """The derivatives with respect to the state at the end, before the first step
+        back."""
+        if self.ts is None:
+            return jtu.tree_map(lambda rows: rows[-1], self.a_ys)
+        # The first step back adds the states that were saved at its end.
+        return jtu.tree_map(lambda rows: jnp.zeros_like(rows[0]), self.a_ys)
+
+    def added_in_step(self, t0: Any, t1: Any, a_y1: Y, num_saved: Array) -> _StepEnds:
+        """Adds to `a_y1` the derivatives with respect to the states that were saved after
+        `t0` and up to `t1`, the last ones of the first `num_saved`.
+
+        Diffrax interpolates these states linearly: the state at the time
+        `t0 + share * (t1 - t0)` is `(1 - share) * y0 + share * y1`."""
+        ends = _StepEnds(a_y1, jtu.tree_map(jnp.zeros_like, a_y1), num_saved)
+        ts = self.ts
+        if ts is None:
+            return ends
+
+        def with_share(a_y: Y, share: Array, index: Array) -> Y:
+            return jtu.tree_map(lambda a, rows: a + share * rows[index], a_y, self.a_ys)
+
+        def add_last(ends: _StepEnds) -> _StepEnds:
+            last = ends.num_saved - 1
+            share = (ts[last] - t0) / (t1 - t0)
+            return _StepEnds(
+                a_y1=with_share(ends.a_y1, share, last),
+                a_y0=with_share(ends.a_y0, 1 - share, last),
+                num_saved=last,
+            )
+
+        def has_more(ends: _StepEnds) -> Bool[Array, ""]:
+            # If no saved state is left, this reads the last time, but does not use it.
+            return (ends.num_saved > 0) & (ts[ends.num_saved - 1] > t0)
+
+        return lax.while_loop(has_more, add_last, ends)
+
+    def added_at_start(self, a_y0: Y, num_saved: Array) -> Y:
+        """Adds to `a_y0` the derivatives with respect to the first `num_saved` states. They
+        were saved at the start of the solve, before any step."""
+        if self.ts is None:
+            return a_y0
+        is_at_start = jnp.arange(len(self.ts)) < num_saved
+
+        def with_saved(a: Array, rows: Array) -> Array:
+            return a + jnp.tensordot(is_at_start, rows, 1)
+
+        return jtu.tree_map(with_saved, a_y0, self.a_ys)
+
+
+# Errors of a state are compared with its size, which is at least this fraction of the size
+# of the next state. So a state at rest has a size, too, although weak increments may take
+# dozens of steps to move it.
 _SIZE_KEPT_PER_STEP = 0.9
 
 
@@ -440,67 +481,30 @@ def _meet_checkpoint(
     agreed_so_far: Bool[Array, ""],
     size: Array,
 ) -> tuple[Y, Bool[Array, ""]]:
-    """The state after `i` steps: the checkpoint if there is one, and otherwise `y_found`;
-    and whether the pass `agreed_so_far` and agrees with this checkpoint, for states of this
-    `size`. `steps_between` is the number of steps from one checkpoint to the next."""
-    # Between checkpoints this reads the checkpoint before, and does not use it.
+    """Compares `y_found`, the state after `i` steps as the backward pass found it, with the
+    checkpoint there, if there is one.
+
+    Returns the checkpoint, or without one `y_found`; and whether the pass `agreed_so_far`
+    and agrees with this checkpoint, too, up to an error in proportion to `size`."""
+    # Between checkpoints this reads the one before, and does not use it.
     row, rest = jnp.divmod(i, steps_between)
     checkpoint = jtu.tree_map(lambda rows: rows[row], checkpoints)
     error = optx.max_norm((y_found**ω - checkpoint**ω).ω)
     # A third of the digits may be lost to rounding errors on the way. The gradients, which
-    # are taken at states between checkpoints, then keep two thirds.
+    # are computed from the states on the way, keep the others.
     eps = float(jnp.finfo(error.dtype).eps)
     agrees = error <= eps ** (2 / 3) * jnp.maximum(size, optx.max_norm(checkpoint))
     is_at_checkpoint = rest == 0
 
-    def saved_if_there_is_one(found: Array, saved: Array) -> Array:
+    def saved_or_found(saved: Array, found: Array) -> Array:
         return jnp.where(is_at_checkpoint, saved, found)
 
-    y = jtu.tree_map(saved_if_there_is_one, y_found, checkpoint)
+    y = jtu.tree_map(saved_or_found, checkpoint, y_found)
     return y, agreed_so_far & (agrees | ~is_at_checkpoint)
 
 
-class _StepCotangents(NamedTuple):
-    """Derivatives of the loss at a step, as saved times are passed on the way back.
-
-    - `a_y1`: with respect to the state at the end of the step.
-    - `a_y0`: with respect to the state at the start of the step, apart from its effect on
-        the state at the end.
-    - `num_saved`: the number of saved times that are not passed yet.
-    """
-
-    a_y1: Y
-    a_y0: Y
-    num_saved: Array
-
-
-def _with_saved_cotangents(
-    t0, t1, ts: Array, a_ys: PyTree[Array], cotangents: _StepCotangents
-) -> _StepCotangents:
-    """`cotangents` with the derivatives `a_ys` added with respect to the states that were
-    saved at those times `ts` after `t0` and up to `t1`. Diffrax interpolates these states
-    linearly: `(1 - share) * y0 + share * y1` at the time `t0 + share * (t1 - t0)`."""
-
-    def with_share(a_y: Y, share: Array, index: Array) -> Y:
-        return jtu.tree_map(lambda a, rows: a + share * rows[index], a_y, a_ys)
-
-    def pass_one(cotangents: _StepCotangents) -> _StepCotangents:
-        last = cotangents.num_saved - 1
-        share = (ts[last] - t0) / (t1 - t0)
-        a_y1 = with_share(cotangents.a_y1, share, last)
-        a_y0 = with_share(cotangents.a_y0, 1 - share, last)
-        return _StepCotangents(a_y1, a_y0, last)
-
-    def has_more(cotangents: _StepCotangents) -> Bool[Array, ""]:
-        # If no saved time is left, this reads the last one, but does not use it.
-        num_saved = cotangents.num_saved
-        return (num_saved > 0) & (ts[num_saved - 1] > t0)
-
-    return lax.while_loop(has_more, pass_one, cotangents)
-
-
 def _steps_without_inverse() -> str:
-    """Steps of solvers for heat baths that shrink areas to zero, for messages: such as
+    """For messages: the steps of solvers for heat baths that have no inverse, such as
     "`BAOAB` with rate of friction times step equal to 2"."""
     return " or of ".join(
         f"`{type(solver).__name__}` with rate of friction times step equal to "
@@ -513,8 +517,8 @@ def _steps_without_inverse() -> str:
 def _checked_gradients(
     agrees: Bool[Array, ""], throw: bool, gradients: PyTree
 ) -> PyTree:
-    """The gradients, if the backward pass agrees with all checkpoints; otherwise an error
-    when run, or without `throw` NaN."""
+    """The gradients, if the backward pass agrees with all checkpoints. Otherwise an error
+    is raised when run, or without `throw`, the gradients are NaN."""
     if throw:
         return eqx.error_if(
             gradients,
@@ -525,7 +529,7 @@ def _checked_gradients(
             "`adjoint=diffrax.RecursiveCheckpointAdjoint()`.",
         )
 
-    # A gradient that is silently wrong would be worse.
+    # NaN is better than a gradient that is silently wrong.
     def or_nan(x: Array) -> Array:
         return jnp.where(agrees, x, cast(Array, jnp.nan))
 

@@ -20,15 +20,14 @@ from ._custom_types import Y
 
 
 _PACKAGE = os.path.dirname(__file__) + os.sep
-# Names of arguments that show that a function takes positions before momenta (or
-# velocities), where momenta come first.
+# Names of arguments that show that a function takes positions before momenta or velocities.
 _POSITIONS_FIRST = (("x", "v"), ("x", "p"), ("q", "v"))
 
 
 class ShortTraceback:
-    """A context in which a `ValueError` that this package raises loses the frames between
-    the function that the user called and the check. Errors from the user's functions keep
-    these frames, and so do all errors with
+    """A context that shortens the traceback of a `ValueError` that this package raises: it
+    drops the frames between the function that the user called and the check. Errors from
+    the user's functions keep all frames, and so do all errors with
     `jax.config.update("jax_traceback_filtering", "off")`."""
 
     def __enter__(self) -> None:
@@ -37,14 +36,14 @@ class ShortTraceback:
     def __exit__(self, kind: Any, error: Any, traceback: Any) -> None:
         if not isinstance(error, ValueError) or _shows_all_frames():
             return
-        # The last frame is that of the line that raised the error, the first that of the
-        # function in which this context stands: without a next, only the first is left.
+        # The last frame is that of the line that raised the error. The first frame is that
+        # of the function in which this context stands, and is the only one to be kept.
         if extract_tb(traceback)[-1].filename.startswith(_PACKAGE):
             traceback.tb_next = None
 
 
 def _shows_all_frames() -> bool:
-    """Whether the user has switched off the filter of JAX."""
+    """Whether the user has switched off JAX's filter of tracebacks."""
     return jax.config.jax_traceback_filtering == "off"  # pyright: ignore
 
 
@@ -84,8 +83,8 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
 def _have_other_order(names: list[str], arguments: tuple[str, ...]) -> bool:
     """Whether the names of a function's parameters show that it takes the arguments in
     another order."""
-    # Names other than those of `arguments` are fine, but one of these in another place is a
-    # mistake. No shape would show it: momenta and positions are alike.
+    # The parameters may have other names. But a name that is one of `arguments` must be in
+    # its place: shapes would not show the mistake, since momenta and positions are alike.
     is_any_misplaced = any(
         name in arguments and name != argument
         for name, argument in zip(names, arguments)
@@ -129,10 +128,11 @@ def check_solver(name: str, solver: Any) -> None:
 
 def check_made_for_noise(solver: diffrax.AbstractSolver) -> None:
     """Raises a `ValueError` for solvers of Diffrax that are for equations without noise, or
-    that wrap another one. Solvers of others need not say which equations they are for."""
+    that wrap another solver. Solvers from elsewhere need not say which equations they are
+    for."""
     kinds = diffrax.AbstractItoSolver | diffrax.AbstractStratonovichSolver
     is_of_diffrax = type(solver).__module__.startswith("diffrax.")
-    # For `isinstance` a `diffrax.HalfSolver` is of the kind of the solver in it.
+    # `issubclass`, since `isinstance` takes a `diffrax.HalfSolver` for the solver in it.
     if is_of_diffrax and not issubclass(type(solver), kinds):
         raise ValueError(
             "`solver` must take fixed steps and be for equations with noise, as those of "
@@ -141,7 +141,7 @@ def check_made_for_noise(solver: diffrax.AbstractSolver) -> None:
 
 
 def check_terms(terms: Any) -> None:
-    """Raises a `ValueError` unless this is a term."""
+    """Raises a `ValueError` unless the argument `terms` is a term."""
     if not isinstance(terms, diffrax.AbstractTerm):
         raise ValueError(
             "`terms` must be Diffrax terms, such as `hamiltonian_terms(H0, noise, path)`, "
@@ -153,8 +153,8 @@ def check_args(args: Any) -> None:
     """Raises a `ValueError` for `args` of which no program can be compiled."""
     for leaf in jtu.tree_leaves(args):
         # Leaves other than numbers, such as strings and functions, become constants of the
-        # program, which is found by them: they must have a hash. An iterator has one, but
-        # yields other values each time.
+        # program. They must have a hash, by which the program is found. An iterator has
+        # one, but yields other values each time.
         has_fixed_value = isinstance(leaf, Hashable) and not isinstance(leaf, Iterator)
         is_constant = has_fixed_value and not eqx.is_array_like(leaf)
         if not (is_numeric(leaf) or is_constant):
@@ -165,8 +165,8 @@ def check_args(args: Any) -> None:
 
 
 def check_numbers(name: str, tree: PyTree) -> None:
-    """Raises a `ValueError` if the argument of this name, a PyTree, holds anything else
-    than numbers and arrays of numbers."""
+    """Raises a `ValueError` unless all leaves of the argument of this name, a PyTree, are
+    numbers or arrays of numbers."""
     for leaf in jtu.tree_leaves(tree):
         if not is_numeric(leaf):
             raise ValueError(
@@ -176,7 +176,8 @@ def check_numbers(name: str, tree: PyTree) -> None:
 
 
 def is_numeric(leaf: Any) -> bool:
-    """Whether JAX takes this for an array."""
+    """Whether JAX takes this for an array of numbers."""
+    # Objects, text and dates, of which JAX has no arrays.
     has_objects = getattr(leaf, "dtype", np.dtype(float)).kind in "OSUMm"
     return eqx.is_array_like(leaf) and not has_objects
 
@@ -184,7 +185,7 @@ def is_numeric(leaf: Any) -> bool:
 def whole_number(name: str, value: Any, least: int = 1, most: int | None = None) -> int:
     """The value of the argument of this name, as an integer of Python. Raises a
     `ValueError` unless it is an integer, from `least` to `most`."""
-    # `True` is an integer to Python.
+    # To Python `True` is an integer.
     is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
     if not is_integer or value < least or (most is not None and value > most):
         expected = "a positive integer"
@@ -200,8 +201,8 @@ def check_memory(
     name: str, number: int, bytes_of_each: int, device: Any = None
 ) -> None:
     """Raises a `ValueError` if the argument of this name asks for more paths at once than
-    fit the memory of a device, by default of this machine. `bytes_of_each` is the least
-    that a path takes."""
+    fit in the memory of a device, by default of this machine. A path takes `bytes_of_each`
+    or more."""
     needed = number * bytes_of_each
     memory = _memory_of(device)
     if needed > memory:
@@ -219,13 +220,13 @@ def _memory_of(device: Any) -> int | float:
     try:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError):
-        # Not every system says it.
+        # Not every operating system tells its memory.
         return math.inf
 
 
 def check_real(name: str, leaves: list) -> None:
-    """Raises a `ValueError` unless the function of this name returned `leaves` that are
-    real: one or more arrays, numbers or structs of arrays."""
+    """Raises a `ValueError` unless the function of this name returned real arrays. `leaves`
+    are the leaves of what it returned: arrays, numbers or structs of arrays."""
     if len(leaves) == 0:
         raise ValueError(f"`{name}` must return real arrays; it returned none.")
     if any(np.size(leaf) == 0 for leaf in leaves if hasattr(leaf, "shape")):
@@ -249,9 +250,9 @@ def _is_real(dtype: Any) -> bool:
 
 
 def checked_not_negative(name: str, value: Any, *, expected: str) -> ArrayLike:
-    """The value of the argument of this name, unchanged. Raises a `ValueError` unless it is
-    a real number or array that is finite and not negative, as far as its values are known
-    while tracing. `expected` is for the message, such as "a number"."""
+    """Returns the value of the argument of this name. Raises a `ValueError` unless it is a
+    real number or array. If it is known while tracing, it must also be finite and not
+    negative. `expected` is for the message, such as "a number"."""
     is_allowed = is_real_number(value)
     if is_allowed and not is_traced(value):
         values = np.asarray(value)
@@ -264,8 +265,8 @@ def checked_not_negative(name: str, value: Any, *, expected: str) -> ArrayLike:
 
 
 def is_real_number(value: Any) -> bool:
-    """Whether this is a real number, or an array of real numbers. Truth values do not
-    count: a mask in place of a number is a mistake."""
+    """Whether this is a real number, or an array of real numbers. Booleans do not count,
+    since a mask in place of a number is a mistake."""
     dtype = getattr(value, "dtype", type(value))
     kinds = (jnp.floating, jnp.integer)
     has_real_dtype = any(jnp.issubdtype(dtype, kind) for kind in kinds)
@@ -325,8 +326,8 @@ def check_state(caller: str, y0: Y) -> None:
                 f"array of dtype {dtype}. Convert it with `.astype(float)`, to float32 or "
                 "float64."
             )
-    # A step would promote the arrays, and Diffrax refuses a state whose dtype changes, with
-    # a message that does not name the dtypes.
+    # A step would promote the arrays to one dtype. Diffrax refuses a state whose dtype
+    # changes, but its message does not name the dtypes.
     dtypes = {str(jnp.result_type(leaf)) for leaf in leaves}
     if len(dtypes) > 1:
         raise ValueError(
@@ -341,8 +342,8 @@ def check_pair(y: PyTree) -> None:
 
 
 def pair_fault(y: PyTree) -> str | None:
-    """A message that says what to pass instead of `y`; `None` if `y` is a pair of the same
-    structure and shapes."""
+    """A message that says what to pass instead of `y`, or `None` if `y` is a pair of the
+    same structure and shapes."""
     advice = (
         "The state of a Hamiltonian system is a pair `(p, q)` of arrays (or PyTrees) of "
         "the same structure and shapes: pass `y0=(p0, q0)`, or for spins "
@@ -354,7 +355,7 @@ def pair_fault(y: PyTree) -> str | None:
             f"{advice}Both are real; got {eqx.tree_pformat(y)}. For complex amplitudes "
             "construct the terms with `wave_terms`."
         )
-    # A list, or a tuple with names, would come back from a step as a plain tuple.
+    # A step returns a plain tuple, also for a list or a tuple with names.
     if type(y) is not tuple or len(y) != 2:
         return f"{advice}Got {eqx.tree_pformat(y)}."
     p, q = y

@@ -1,5 +1,5 @@
-"""Control flow for batches: loops that all paths share, work that only stragglers need, and
-values that are computed once."""
+"""Control flow for batches of paths under `vmap`: loops that all paths share, work for only
+those paths that need it, and values that are computed once."""
 
 import functools as ft
 from collections.abc import Callable
@@ -18,17 +18,18 @@ from ._custom_types import IntScalarLike
 
 _T = TypeVar("_T")
 
-# Stragglers are gathered and served in groups of the batch's size over this number, so that
-# no batch has more groups. Usually there are few stragglers, and each group costs its full
-# size. When all paths computed for as long as any was pending, ensembles with a few hard
-# paths took 8 to 85 times as long.
+# Stragglers are the paths that need more work than most. They are gathered from the batch
+# and served in groups. The size of a group is that of the batch divided by this number, so
+# that there are at most this many groups. Groups are small, since usually there are few
+# stragglers, and each group costs its full size. When all paths computed for as long as any
+# was pending, ensembles with a few hard paths took 8 to 85 times as long.
 _MOST_GROUPS = 256
 
 
 @jax.custom_batching.custom_vmap
 def largest_in_batch(number: IntScalarLike) -> IntScalarLike:
-    """The largest `number` over all paths of a batch, itself not batched. A loop of this
-    length keeps unbatched values unbatched."""
+    """The largest `number` over all paths of a batch. The result is not batched, so that a
+    loop of this length keeps unbatched values unbatched."""
     return number
 
 
@@ -36,7 +37,7 @@ def largest_in_batch(number: IntScalarLike) -> IntScalarLike:
 def _(size, in_batched, number):
     del size
     largest = jnp.max(number, 0) if in_batched[0] else number
-    # The function is called again, since an outer batch may have numbers, too.
+    # The function is called again for outer batches, which may have other numbers.
     return largest_in_batch(largest), False
 
 
@@ -48,8 +49,8 @@ def batched_like(values: _T, others: PyTree) -> _T:
     time to trace `StrangGauss`.
     """
     arrays = [leaf for leaf in jtu.tree_leaves(others) if eqx.is_array(leaf)]
-    # `jnp.array` makes arrays of JAX, and no operations of the program: `custom_jvp` does
-    # not convert arrays of NumPy, over which a user may have batched.
+    # `custom_jvp` does not convert arrays of NumPy, over which a user may have batched.
+    # `jnp.array` converts them, without an operation in the program.
     return _batched(*jtu.tree_map(jnp.array, (values, arrays)))
 
 
@@ -61,7 +62,7 @@ def _all_or_none(values: _T, others: list[Array]) -> _T:
 
 @_all_or_none.def_vmap
 def _(size, in_batched, values, others):
-    # JAX calls this rule only if anything is batched. Then all values become so.
+    # JAX calls this rule only if anything is batched. Then all values become batched.
     repeated = _repeated(size, in_batched[0], values)
     return _all_or_none(repeated, others), _all_batched(values)
 
@@ -90,8 +91,8 @@ def _(primals, tangents):
 
 
 def error_if_alone(pred: Bool[Array, ""], message: str) -> Bool[Array, ""]:
-    """Returns `pred`, and raises an error when run if it is true. Under `vmap` nothing is
-    raised, since an error of one path would stop all others of its batch."""
+    """Returns `pred`. If it is true, raises an error when run, except under `vmap`, where
+    an error of one path would stop all others of its batch."""
 
     @jax.custom_batching.custom_vmap
     def checked(pred):
@@ -106,8 +107,8 @@ def error_if_alone(pred: Bool[Array, ""], message: str) -> Bool[Array, ""]:
 
 
 def refused_where(fault: Bool[Array, ""], advice: str) -> Bool[Array, ""]:
-    """Returns `fault`. If it is true, raises a `ValueError`; or if it is not known while
-    tracing, an error when run, except under `vmap`, as `error_if_alone`."""
+    """Returns `fault`. If it is true, raises a `ValueError` with this advice. If it is not
+    known while tracing, it is checked when run, as by `error_if_alone`."""
     if is_traced(fault):
         return error_if_alone(fault, advice)
     if fault:
@@ -119,15 +120,17 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
     """`fn(value)` where `pending`, and `value` elsewhere. Not differentiable.
 
     Under `vmap` a conditional becomes a select: all paths compute, with memory for all.
-    Here the stragglers (`pending` paths) are gathered from the batch and served in groups.
+    Here the stragglers, the paths that are `pending`, are gathered from the batch and
+    served in groups.
     """
     # `fn` is traced once, here: under `vmap`, `jax.jit` would trace it again.
     call, arrays = with_captured_arrays(fn, value)
     # Each level of nested batches runs the same program.
     in_groups = jax.jit(ft.partial(_in_groups, call))
 
-    # Of the arrays that `fn` captures, each path has its own, with a leading axis for the
-    # paths, and all paths have common ones.
+    # Of the arrays that `fn` captures, `own_arrays` have a leading axis for the paths, and
+    # `common_arrays` are the same for all paths. Both have the structure of `arrays`, with
+    # `None` in place of arrays in the other.
     @jax.custom_batching.custom_vmap
     def serve(pending, value, own_arrays, common_arrays):
         return in_groups(pending, value, own_arrays, common_arrays)
@@ -135,14 +138,11 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
     # Nested batches are joined into one, so that stragglers of all share the groups: arrays
     # of paths, of shape `(outer, inner, ...)`, become `(outer * inner, ...)`.
     @serve.def_vmap
-    def _(outer_size, in_batched, *paths_and_common):
-        # The first three arguments have an axis for the inner paths, `common_arrays` have
-        # none.
+    def _(outer_size, in_batched, pending, value, own_arrays, common_arrays):
+        # All arguments but the last have an axis for the inner paths.
         *are_paths_batched, are_common_batched = in_batched
-        *inner_paths, common_arrays = paths_and_common
-        paths = _repeated(outer_size, are_paths_batched, inner_paths)
-        pending, _, _ = paths
-        _, inner_size = pending.shape
+        paths = _repeated(outer_size, are_paths_batched, [pending, value, own_arrays])
+        _, inner_size = paths[0].shape
 
         def join_axes(x: Array) -> Array:
             return x.reshape(outer_size * inner_size, *x.shape[2:])
@@ -150,8 +150,8 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
         def separate_axes(x: Array) -> Array:
             return x.reshape(outer_size, inner_size, *x.shape[1:])
 
-        # A common array that differs between the outer batches is repeated for the inner
-        # ones, and is one of the paths' own.
+        # A common array that differs between outer batches is no longer common. It is
+        # repeated for the inner paths.
         def own_if_batched(is_batched: bool, x: Array) -> Array | None:
             return jnp.repeat(x, inner_size, axis=0) if is_batched else None
 
@@ -192,9 +192,8 @@ def _in_groups(
     own_arrays: PyTree[Array | None],
     common_arrays: PyTree[Array | None],
 ) -> _T:
-    """`value` of a batch, with `call` applied for the paths that are `pending`. The second
-    argument of `call` are the arrays that it captures: of `own_arrays`, with an axis for
-    the paths, and of `common_arrays`, without."""
+    """`value` of a batch, with `call` applied for the paths that are `pending`. The arrays
+    are as in `where_pending`: together they are the second argument of `call`."""
     size = len(pending)
     # The quotient is rounded up, so that a small batch has groups of one.
     group_size = -(-size // _MOST_GROUPS)
@@ -207,26 +206,26 @@ def _in_groups(
         return value
 
     if size == 1:
-        # A conditional is cheaper than a loop, and stays one: there is no batch.
+        # A conditional is cheaper than a loop. It does not become a select, since there is
+        # no batch.
         only_path = _first((value, own_arrays))
         return _with_axis(lax.cond(pending[0], call_for_path, keep_value, *only_path))
 
     def serve_group(carry):
-        """Applies `call` for the next group of the paths that are pending, and removes
-        these from `pending`."""
+        """Applies `call` for the next group of pending paths, which are then no longer
+        pending."""
         pending, value = carry
-        # The first pending paths, by their numbers in the batch: the largest entries of
-        # zeros and ones. (`jnp.nonzero` compiles to a dozen kernels.) If fewer paths are
-        # pending than a group has, the rest of it gets the number `size`, which is beyond
-        # the batch, so that `scatter` drops it. Unsigned numbers need no code for negative
-        # ones.
-        is_pending, numbers = lax.top_k(pending.astype(jnp.float32), group_size)
-        places = jnp.where(is_pending > 0, numbers, size).astype(jnp.uint32)
-        gathered = jtu.tree_map(lambda x: x[places], (value, own_arrays))
+        # The indices of the first pending paths are those of the largest entries of zeros
+        # and ones. (`jnp.nonzero` compiles to a dozen kernels.) If fewer paths are pending
+        # than a group has, the others get the index `size`, which is beyond the batch, so
+        # that `scatter` drops them. Unsigned indices need no code for negative ones.
+        is_pending, first = lax.top_k(pending.astype(jnp.float32), group_size)
+        indices = jnp.where(is_pending > 0, first, size).astype(jnp.uint32)
+        gathered = jtu.tree_map(lambda x: x[indices], (value, own_arrays))
         values_of_group = jax.vmap(call_for_path)(*gathered)
 
         def scatter(x: Array, x_of_group: Any) -> Array:
-            return x.at[places].set(x_of_group, mode="drop")
+            return x.at[indices].set(x_of_group, mode="drop")
 
         pending = scatter(pending, False)
         return pending, jtu.tree_map(scatter, value, values_of_group)
@@ -248,9 +247,9 @@ def materialize(fn: Callable[[], _T]) -> _T:
     branch of a conditional, and a barrier hides that the condition is always true.
     """
 
-    # `fn` is traced once, although it is called for its shapes, in a branch, and elsewhere
-    # than on CPUs. (It is wrapped in a function, since JAX names what it traces, and prints
-    # a bound method with all that it is bound to, for 50 ms each time.)
+    # With `jit`, `fn` is traced once for all three uses of `once` below. (The wrapper is a
+    # function, since JAX prints the name of what it traces. For a bound method it prints
+    # the whole object to which the method is bound, which takes 50 ms each time.)
     @jax.jit
     def once() -> _T:
         return fn()

@@ -9,8 +9,9 @@ import diffrax
 import jax.tree_util as jtu
 
 
-# A link in a docstring, and a field of an entry in BibTeX.
+# A link in a docstring.
 _DOI = re.compile(r"https://doi\.org/([^\s)]+)")
+# A field of an entry in BibTeX.
 _DOI_FIELD = re.compile(r"doi = \{(.*?)\}")
 
 
@@ -29,7 +30,7 @@ def citation(*args: Any, **kwargs: Any) -> None:
     bound = inspect.signature(diffrax.diffeqsolve).bind_partial(*args, **kwargs)
     entries = _entries()
     for cls in _classes(bound.arguments):
-        # The sources of a class are the links in its docstring, here each of them once.
+        # The sources of a class are the links in its docstring. Each counts once.
         dois = list(dict.fromkeys(_DOI.findall(cls.__doc__ or "")))
         if len(dois) > 0:
             print(
@@ -44,15 +45,14 @@ def citation(*args: Any, **kwargs: Any) -> None:
 
 def _classes(tree: Any) -> list[type]:
     """The classes of this package that occur in `tree`, in order."""
-    # A dictionary in place of a set, to keep the order.
+    # A dictionary in place of a set keeps the order.
     classes: dict[type, None] = {}
 
-    # JAX calls this for each node on the way down, also for containers and modules, which
-    # are no leaves.
+    # JAX calls `is_leaf` for each node on the way down, also for containers and modules.
     def record(node: Any) -> bool:
         if type(node).__module__.split(".")[0] == "diffrax_symplectic":
             classes[type(node)] = None
-        # JAX goes on to what the node holds.
+        # With `False`, JAX goes on to what the node holds.
         return False
 
     jtu.tree_leaves(tree, is_leaf=record)
@@ -66,7 +66,7 @@ def _entries() -> dict[str, str]:
     by_doi = {}
     for entry in entries:
         match = _DOI_FIELD.search(entry)
-        # Books without a DOI cannot be linked to, so no docstring asks for them.
+        # A book without a DOI cannot be linked to, so no docstring asks for its entry.
         if match is not None:
             by_doi[match[1]] = entry
     return by_doi

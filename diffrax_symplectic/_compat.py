@@ -1,11 +1,9 @@
-"""What this package uses of others that they do not promise to keep, by its use.
+"""What this package uses of other packages although they do not promise to keep it.
 
 Some of it is private, some is public but undocumented, and some is how a class happens to
-store what it was given. It is used nowhere else. If a test of it in
-`tests/test_private_parts.py`, or of what uses it, fails after an upgrade, change the
-function here.
-(What operations of MLIR tell is read in `_stablehlo/mlir.py` and `operation.py`, in the
-same way.)
+store its arguments. Other modules use it only through the names here. If a test in
+`tests/test_private_parts.py` fails after an upgrade, change the function here.
+(`_stablehlo/mlir.py` and `operation.py` do the same for operations of MLIR.)
 """
 
 import dataclasses
@@ -42,7 +40,7 @@ from jaxtyping import Array, PRNGKeyArray, PyTree
 from ._parts import parts_of, with_parts
 
 
-# Operations that only call a function, and the parameter that holds it.
+# Operations that only call a function, and the parameter that holds the function.
 CALLS = {
     "checkpoint": "jaxpr",
     "closed_call": "call_jaxpr",
@@ -55,38 +53,38 @@ CALLS = {
 
 
 def is_threefry(key: PRNGKeyArray) -> bool:
-    """Whether the key belongs to JAX's default generator, by its name, which is all that
-    JAX tells of a generator."""
+    """Whether the key belongs to JAX's default generator."""
+    # JAX tells only the name of a generator.
     return str(jr.key_impl(key)) == "threefry2x32"
 
 
 def is_traced(x: Any) -> bool:
-    """Whether this value is known only when the program runs."""
+    """Whether the value `x` is known only when the program runs."""
     return isinstance(x, jax.core.Tracer)
 
 
 def at_trace_time() -> Any:
-    """A context in which operations on known values are carried out at once, so that their
-    results are known, too, inside of `jax.jit`."""
+    """A context in which operations on known values are carried out at once, even inside of
+    `jax.jit`, so that their results are known while tracing."""
     return jax.ensure_compile_time_eval()
 
 
 def is_result(x: Any) -> bool:
-    """Whether this says how a solve ended, such as a `diffrax.RESULTS`. The results of
-    Diffrax, Optimistix and Lineax have one class in common, which none of them names."""
+    """Whether `x` says how a solve ended, such as a `diffrax.RESULTS`. The results of
+    Diffrax, Optimistix and Lineax have a class in common, which is not public."""
     return isinstance(x, type(diffrax.RESULTS.successful))
 
 
 def is_closure_mismatch(error: ValueError) -> bool:
-    """Whether Equinox refused to call what it converted from a closure with arrays of
-    another type, as it does on several devices. It has no class of errors for this."""
+    """Whether Equinox raised the error because a closure that it had converted was called
+    with arrays of another type, as on several devices. It has no class of errors for
+    this."""
     return "Closure-converted function" in str(error)
 
 
 @ft.cache
 def quick_options() -> dict[str, bool]:
-    """Options by which XLA compiles with its older generator of code for CPUs, if it has
-    it."""
+    """Options for compiling with XLA's older generator of code for CPUs, if it has one."""
     options = {"xla_cpu_use_fusion_emitters": False}
     try:
         jax.jit(lambda: 0, compiler_options=options).lower().compile()
@@ -116,8 +114,8 @@ def unwrapped(term: diffrax.AbstractTerm) -> diffrax.AbstractTerm:
 
 
 def wrapped_like(term: diffrax.AbstractTerm, new: diffrax.AbstractTerm) -> Any:
-    """`new` in the place of a term that Diffrax may have wrapped, in the same direction of
-    time."""
+    """`new` for use in place of `term`, which Diffrax may have wrapped, in the same
+    direction of time."""
     return WrapTerm(new, term.direction) if isinstance(term, WrapTerm) else new
 
 
@@ -130,7 +128,7 @@ def not_a_path(term: diffrax.ControlTerm) -> Any:
 
 def resolution(tree: diffrax.VirtualBrownianTree) -> Any:
     """The length of time below which a tree only interpolates, its `tol`."""
-    # It is stored in units of the length of the tree.
+    # The tree stores it in units of its own length.
     return tree.tol * (tree.t1 - tree.t0)
 
 
@@ -156,10 +154,10 @@ def is_adjoint_term(term: diffrax.AbstractTerm) -> bool:
 
 
 def with_captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[Any]]:
-    """Returns a function `call(value, arrays)` for `fn(value)`, which takes the arrays that
-    `fn` captures as an argument; and these arrays.
-    (`eqx.filter_closure_convert` would refuse them under `shard_map`, which changes the
-    types that it checks.)"""
+    """Returns a function `call` and the arrays that `fn` captures, such that
+    `call(value, arrays)` is `fn(value)`.
+    (`eqx.filter_closure_convert` would refuse the arrays under `shard_map`, which changes
+    the types that it checks.)"""
     traced, struct = jax.make_jaxpr(fn, return_shape=True)(value)
     result_treedef = jtu.tree_structure(struct)
 
@@ -171,71 +169,79 @@ def with_captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[An
 
 
 def is_program(x: Any) -> bool:
-    """Whether this is a jaxpr, among the parameters of an operation."""
+    """Whether a parameter of an operation is a jaxpr."""
     return isinstance(x, Jaxpr | ClosedJaxpr)
 
 
 def is_rule(x: Any) -> bool:
-    """Whether this parameter of an operation is a function, such as the rule of a custom
+    """Whether a parameter of an operation is a function, such as the rule of a custom
     derivative, or a callback."""
-    # Types and meshes of devices are callable, but no rules. Some rules JAX wraps in an
-    # object that is not callable, with the function as `call_wrapped`.
+    # Types and meshes of devices are callable, but no functions. JAX wraps some functions
+    # in an object that is not callable, and has the function as `call_wrapped`.
     if isinstance(x, type | jax.sharding.Mesh):
         return False
     return callable(x) or hasattr(x, "call_wrapped")
 
 
+# The `operation` of an `OperandPlace` for a value that the program returns.
+RESULTS = -1
+
+
 class OperandPlace(NamedTuple):
     """Where a program reads a value.
 
-    - `operation`: the number of the operation that reads it. The number after that of the
-        last operation stands for what the program returns.
-    - `position`: its position among the arguments of the operation, or among the results of
-        the program.
+    - `operation`: the number of the operation that reads the value, or `RESULTS`.
+    - `position`: the position of the value among the arguments of the operation, or among
+        the results of the program.
     """
 
     operation: int
     position: int
 
 
-def with_constants_at(jaxpr: Jaxpr, places: Sequence[OperandPlace]) -> Jaxpr:
-    """The program that reads a new constant in each of these places. The new constants come
-    after those that it has."""
+def with_constants_at(
+    jaxpr: Jaxpr, places: Sequence[OperandPlace]
+) -> tuple[Jaxpr, list[Any]]:
+    """The program that reads a new constant in each of these places, and the values that it
+    read there before. The new constants come after those that the program has."""
+    # The results of the program come last, at the index `RESULTS`.
     operands: list[list[Any]] = [list(eqn.invars) for eqn in jaxpr.eqns]
     operands.append(list(jaxpr.outvars))
-    avals = [operands[place.operation][place.position].aval for place in places]
-    structs = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
-    for place, constant in zip(places, _variables_like(*structs)):
+    replaced = [operands[place.operation][place.position] for place in places]
+    structs = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in replaced]
+    constants = _variables_like(*structs)
+    for place, constant in zip(places, constants):
         operands[place.operation][place.position] = constant
     *operands_of_eqns, results = operands
     eqns = [eqn.replace(invars=xs) for eqn, xs in zip(jaxpr.eqns, operands_of_eqns)]
-    constants = [*jaxpr.constvars, *_variables_like(*structs)]
-    return jaxpr.replace(eqns=eqns, outvars=results, constvars=constants)
+    constvars = [*jaxpr.constvars, *constants]
+    jaxpr = jaxpr.replace(eqns=eqns, outvars=results, constvars=constvars)
+    return jaxpr, replaced
 
 
 @ft.lru_cache(maxsize=128)
 def _variables_like(*structs: jax.ShapeDtypeStruct) -> list[Any]:
     """Variables of programs for arrays like these."""
-    # The constructor of a variable differs between versions of JAX. So JAX makes them: they
-    # are the inputs of a trace of the identity.
+    # The constructor of a variable differs between versions of JAX. So JAX makes the
+    # variables, as the inputs of a trace of the identity.
     return jax.make_jaxpr(lambda *xs: xs)(*structs).jaxpr.invars
 
 
 # Made on import, since no such context may be made while other threads use JAX.
-_numbered_traces = jax.make_user_context(0)
+_number_of_traces = jax.make_user_context(0)
 
 
 def with_traces_of(number: int) -> Any:
     """A context in which JAX uses a trace again only if it was made in a context of the
-    same number. Otherwise JAX would use the trace of an inner function, such as
-    `diffrax.diffeqsolve`, whenever its arguments are the same objects, although a function
-    among them may compute something else by now."""
-    return _numbered_traces(number)
+    same number. Elsewhere JAX uses the trace of an inner function, such as
+    `diffrax.diffeqsolve`, again whenever its arguments are the same objects, although a
+    function among them may compute something else by now."""
+    return _number_of_traces(number)
 
 
 def evaluated(jaxpr: Jaxpr, consts: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
-    """The results of a program. Operations keep the lines of the user's code that they come
-    from, by which messages name them."""
+    """The results of a program. Error messages name the lines of the user's code that its
+    operations come from."""
     return jax.core.eval_jaxpr(jaxpr, consts, *inputs)
 
 
@@ -263,8 +269,8 @@ def results_of_program(
     args: Sequence[Any],
     results_of: Callable[[JaxprEqn, list[Any]], Sequence[Any]],
 ) -> list[Any]:
-    """The results of a program for these arguments, operation by operation: `results_of`
-    gives those of one, for its arguments."""
+    """The results of a program for these arguments, operation by operation. The results of
+    each operation are `results_of(eqn, args)`, for the arguments of this operation."""
     jaxpr = getattr(program, "jaxpr", program)
     consts = getattr(program, "consts", [])
     values = dict(zip(jaxpr.constvars, consts)) | dict(zip(jaxpr.invars, args))
@@ -279,14 +285,14 @@ def results_of_program(
 
 
 def has_blocking_lapack() -> bool:
-    """Whether calls of LAPACK that run at the same time can block each other, as on CPUs by
-    the versions of JAX that share out a batch in the pool from which they are called."""
+    """Whether calls of LAPACK that run at the same time can block each other. They can on
+    CPUs, where JAX shares out a batch in the pool of threads that makes the calls."""
     shares_out_batches = (0, 10, 0) <= jax.__version_info__ < (0, 11, 2)
     return shares_out_batches and jax.default_backend() == "cpu"
 
 
 def stablehlo_module(program: Any) -> Any:
-    """The module of MLIR of a program in StableHLO: parsed from its text, or what
+    """The module of MLIR for a program in StableHLO. `program` is its text, or what
     `compiler_ir("stablehlo")` of a lowered function returned."""
     if not isinstance(program, str):
         return program
@@ -295,13 +301,13 @@ def stablehlo_module(program: Any) -> Any:
 
 
 def is_literal(x: Any) -> bool:
-    """Whether the value of an array of Dr.Jit is known while a kernel is recorded: it is a
-    constant, or was computed from constants."""
+    """Whether the value of an array of Dr.Jit is known while a kernel is recorded, as that
+    of a constant, or of an array that was computed from constants."""
     return x.state.name == "Literal"
 
 
 class SolveState(NamedTuple):
-    """What is used here of the state of Diffrax's loop over steps.
+    """The parts that are used here of the state of Diffrax's loop over steps.
 
     - `y`: the state of the equation.
     - `num_steps`: the number of steps so far.
@@ -316,7 +322,7 @@ class SolveState(NamedTuple):
 
 
 def solve_state(loop_state: Any) -> SolveState:
-    """The parts of a state of Diffrax's loop."""
+    """The parts that are used here of a state of Diffrax's loop."""
     return SolveState(
         y=loop_state.y,
         num_steps=loop_state.num_steps,
@@ -330,8 +336,7 @@ def without_derivatives(loop_state: Any, stop_gradient: Callable) -> Any:
     equation, and with `stop_gradient(x)` in place of each leaf `x` of the solver's
     state."""
     solver_state = jtu.tree_map(stop_gradient, loop_state.solver_state)
-    # In place of the state there is an object that is no array, so that using it by mistake
-    # is an error.
+    # `y` becomes an object that is no array, so that using it by mistake is an error.
     return dataclasses.replace(loop_state, y=object(), solver_state=solver_state)
 
 
@@ -341,16 +346,17 @@ def with_y(loop_state: Any, y: PyTree[Array]) -> Any:
 
 
 def with_only_ys_differentiable(loop_state: Any) -> Any:
-    """A state of Diffrax's loop with an error for derivatives of anything but the saved
-    states."""
+    """A state of Diffrax's loop of which only the saved states can be differentiated. For
+    derivatives of anything else an error is raised."""
     ys = loop_state.save_state.ys
     refused = nondifferentiable_backward(loop_state, symbolic=False)
     return eqx.tree_at(lambda state: state.save_state.ys, refused, ys)
 
 
 def run_steps(adjoint: Any, outer_while_loop: Callable, **kwargs: Any) -> Any:
-    """Runs Diffrax's loop over steps, for an adjoint, with `outer_while_loop` for it and
-    an ordinary loop for the times to save at. `kwargs` are those of `adjoint.loop`."""
+    """Runs Diffrax's loop over steps for an adjoint. `outer_while_loop` loops over steps,
+    and an ordinary loop over the times to save at. `kwargs` are those of
+    `adjoint.loop`."""
     return adjoint._loop(
         **kwargs,
         event=None,
@@ -361,12 +367,12 @@ def run_steps(adjoint: Any, outer_while_loop: Callable, **kwargs: Any) -> Any:
 
 def saves_states(sub_saveat: diffrax.SubSaveAt) -> bool:
     """Whether the states themselves are saved, not a function of them."""
-    # The default is a private function, the same object in each.
+    # By default `fn` is a private function of Diffrax, the same object in each instance.
     return sub_saveat.fn is diffrax.SubSaveAt(t1=True).fn
 
 
 class StepTimes(NamedTuple):
-    """The times of the steps of a solve, computed by its controller.
+    """The times at which the steps of a solve begin and end, computed by its controller.
 
     - `controller`: `diffrax.ConstantStepSize` or `diffrax.StepTo`.
     - `init_state`: the state of Diffrax's loop before the first step.
@@ -390,9 +396,8 @@ class StepTimes(NamedTuple):
         _, *other_state = self.init_state.controller_state
         initial_time = self.init_state.tprev
         time_after_first_step = self.init_state.tnext
-        # A constant step size is asked for the next step after `i - 1` steps, the number
-        # that its state begins with. It answers with the start and the end of that step,
-        # and more. The start is the `t1` that it is given, and is not used.
+        # The controller is asked for the step after `i - 1` steps, the first entry of its
+        # state. Of its results only the end of that step is used.
         _, _, time_after_step, *_ = self.controller.adapt_step_size(
             t0=initial_time,
             t1=time_after_first_step,

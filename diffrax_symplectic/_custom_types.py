@@ -1,3 +1,5 @@
+"""Types for annotations."""
+
 from typing import Any, TYPE_CHECKING, TypeAlias
 
 import diffrax
@@ -15,7 +17,7 @@ else:
 Args: TypeAlias = PyTree[Any]
 Y: TypeAlias = PyTree[Shaped[ArrayLike, "?*y"], "Y"]
 BM: TypeAlias = PyTree[Shaped[ArrayLike, "?*bm"], "BM"]
-# Terms one by one, such as those of the drift.
+# Several terms, such as those of the drift.
 Terms: TypeAlias = tuple[diffrax.AbstractTerm, ...]
-# Instances of `jax.Device`, which is no name of a type for type checkers.
+# Instances of `jax.Device`, which type checkers do not take for a type.
 Devices: TypeAlias = tuple[Any, ...]

@@ -2,12 +2,12 @@
 
 On CPUs, JAX 0.10 shares out the matrices of a batch between the threads of XLA's pool, and
 the thread that calls LAPACK waits for the others. XLA runs operations that do not depend on
-each other at the same time, in the same pool. Once every thread of it waits in a call of
-LAPACK, no thread is left to do the work, and the program never returns. On two cores, two
-calls suffice. JAX 0.11.2 computes a batch in the thread that calls.
+each other at the same time, in the same pool. Once every thread of the pool waits in a call
+of LAPACK, no thread is left to do the work, and the program never returns. On two cores,
+two calls suffice. JAX 0.11.2 computes a batch in the thread that calls.
 
-Options of XLA only make this rarer. So here each call is made to depend on the results of
-the one before, and no two of them ever run at the same time.
+Options of XLA only make such a deadlock rarer. So here each call is made to depend on the
+results of the call before, and no two calls ever run at the same time.
 
 This module, `has_blocking_lapack` and the uses of `lapack_in_turn` can go as soon as
 `pyproject.toml` asks for JAX 0.11.2 or later.
@@ -44,8 +44,8 @@ _CONTROL_FLOW = frozenset({"cond", "scan", "while"})
 
 
 def lapack_in_turn(fn: Callable) -> Callable:
-    """`fn`, with its calls of LAPACK one after another where JAX needs that. The result is
-    the same. For functions that are compiled and not transformed any further."""
+    """`fn`, with its calls of LAPACK one after another where this version of JAX needs it.
+    The results are the same. `fn` may be compiled, but not transformed any further."""
 
     @ft.wraps(fn)
     def call(*args: Any) -> Any:
@@ -61,9 +61,9 @@ def lapack_in_turn(fn: Callable) -> Callable:
 
 
 def _run_in_turn(program: Jaxpr | ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
-    """The results of a program for these arguments. Each call of LAPACK waits for the one
+    """The results of a program for these arguments. Each call of LAPACK waits for the call
     before."""
-    # The results of the last call so far.
+    # The results of the last call of LAPACK so far.
     results_before: Sequence[Any] = ()
 
     def results_of_eqn(eqn: Any, args: list[Any]) -> Sequence[Any]:
@@ -74,14 +74,15 @@ def _run_in_turn(program: Jaxpr | ClosedJaxpr, args: Sequence[Any]) -> list[Any]
         if name in CALLS:
             return results_of_program(eqn.params[CALLS[name]], args, results_of_eqn)
         if name == "custom_linear_solve":
-            # Its arguments are the constants of four functions, of which `solve` is the
-            # third, and the right-hand side.
+            # Its arguments are the constants of four functions, and the right-hand side.
+            # The third of these functions, `solve`, is the one that runs.
             lengths = eqn.params["const_lengths"]
             begin = lengths.matvec + lengths.vecmat
             constants = args[begin : begin + lengths.solve]
             args = [*constants, *args[sum(lengths) :]]
             return results_of_program(eqn.params["jaxprs"].solve, args, results_of_eqn)
-        # A loop as a whole waits for the call before, and the next call for the loop.
+        # What is left is a call of LAPACK or control flow around such calls. Control flow
+        # as a whole waits for the call before, and the next call waits for it.
         params = eqn.params
         if name in _CONTROL_FLOW:
             params = jtu.tree_map(_with_turns_inside, params, is_leaf=is_program)
@@ -101,13 +102,13 @@ def _calls_lapack(eqn: Any) -> bool:
 
 
 def _with_dependence(args: list[Any], results_before: Sequence[Any]) -> list[Any]:
-    """`args`, with the same values, but computed from all of `results_before`, too, so that
-    an operation on them waits for these."""
+    """Arguments of the same values that also depend on all of `results_before`, so that an
+    operation on the arguments waits for these results."""
     if len(results_before) == 0:
         return args
-    # `never` is false, since it starts as false, but a barrier hides this from XLA: so the
+    # `never` starts as false, so it stays false. A barrier hides this from XLA, so that the
     # arguments wait for an entry of each result. A barrier around results and arguments
-    # does not suffice: XLA removes it before it looks which operations can run side by
+    # would not suffice: XLA removes it before it decides which operations can run side by
     # side.
     never = lax.optimization_barrier(jnp.array(False))
     for x in results_before:
@@ -125,11 +126,11 @@ def _has_numbers(x: Any) -> bool:
 
 
 def _with_turns_inside(param: Any) -> Any:
-    """A parameter of an operation. If it is a program, each call of LAPACK in it waits for
-    the one before."""
+    """The parameter of an operation. If it is a program, each call of LAPACK inside of it
+    waits for the call before."""
     if not isinstance(param, ClosedJaxpr):
         return param
     structs = [variable.aval for variable in param.jaxpr.invars]
-    # The calls of the program wait for each other only: the operation as a whole waits for
-    # those before.
+    # The first call inside of the program need not wait, since the operation as a whole
+    # waits for the calls before.
     return jax.make_jaxpr(lambda *args: _run_in_turn(param, args))(*structs)

@@ -13,7 +13,8 @@ _Tree = TypeVar("_Tree", bound=PyTree)
 
 
 def parts_of(kind: type[_T] | tuple[type[_T], ...], tree: PyTree) -> list[_T]:
-    """The parts of this class, one for each place. Parts within them do not count."""
+    """All parts of this class in a PyTree. One that occurs twice is returned twice. Parts
+    within other parts are not returned."""
     is_part = ft.partial(_is_instance, kind)
     return [x for x in jtu.tree_leaves(tree, is_leaf=is_part) if is_part(x)]
 
@@ -34,8 +35,8 @@ def _is_instance(kind: Any, x: Any) -> bool:
     return _is_subclass(type(x), kind)
 
 
-# `isinstance(x, kind)` reads `x.__class__`, for which a Module takes a microsecond. A call
-# of `expectation` looks at some thousand Modules.
+# `isinstance(x, kind)` reads `x.__class__`, which takes a microsecond for a Module, and a
+# call of `expectation` asks for some thousand Modules. So the answers are kept by class.
 @ft.lru_cache(maxsize=1024)
 def _is_subclass(kind_of_x: type, kind: Any) -> bool:
     return issubclass(kind_of_x, kind)

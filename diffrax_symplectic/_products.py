@@ -1,5 +1,5 @@
-"""Products of arrays whose factors are not rounded. By default accelerators round them to
-half their digits, or fewer."""
+"""Products of arrays in full precision. By default accelerators round the factors to half
+their digits, or fewer."""
 
 import functools as ft
 

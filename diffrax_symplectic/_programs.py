@@ -1,16 +1,16 @@
 """Programs, found by what they compute.
 
-JAX finds a program by the function that it was traced from, as an object. So a function
-that reads a global keeps its value of the first call, and a new function of the same text
+JAX finds a compiled program by the identity of the function that was traced. So a function
+that reads a global keeps the value of the first call, and a function that is defined again
 compiles anew. Here the user's functions are traced in each call of this package, and equal
-traces are one object. To trace a Hamiltonian takes a millisecond, to compile an expectation
-takes seconds.
+traces become one object, by which JAX finds the compiled program. To trace a Hamiltonian
+takes a millisecond, to compile an expectation takes seconds.
 
-- `traced`: the user's function as a `Traced`, by which JAX finds the programs that call it.
-- `compiled`: `equinox.filter_jit`, which keeps a limited number of programs.
-- `once_for_each_signature`: for functions that read no values of arrays.
-- `current_traces`: for functions that call `diffrax.diffeqsolve` themselves.
-- `digest`: what tells one computation from another, also in other processes.
+- `traced`: traces a function of the user.
+- `compiled`: as `equinox.filter_jit`, with a limited number of programs.
+- `once_for_each_signature`: calls a function that reads no values of arrays only once.
+- `current_traces`: traces a function of the user that calls `diffrax.diffeqsolve`.
+- `digest`: a hash of a computation, which is the same in other processes.
 """
 
 import collections
@@ -23,8 +23,8 @@ import re
 import threading
 import types
 import weakref
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple, TypeVar
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias, TypeGuard, TypeVar
 
 import equinox as eqx
 import jax
@@ -44,40 +44,44 @@ from ._compat import (
     Literal,
     OperandPlace,
     quick_options,
+    RESULTS,
     with_constants_at,
     with_traces_of,
 )
 
 
-# The most programs that are kept, each of up to 30 MB. A call of `expectation` needs up to
-# ten. What is dropped is compiled again when it is needed again.
+# The most compiled programs that are kept, each of up to 30 MB. A call of `expectation`
+# needs up to ten. A program that was dropped is compiled again when it is needed again.
 _MOST_PROGRAMS = 64
-# The most calls that are compared. Functions that are made anew in each trace would add to
-# them without end.
+# The most calls of the user's functions that `current_traces` compares. A function that is
+# made anew in each trace adds a call each time, without end.
 _MOST_CALLS = 64
-# The most results that a function remembers. Each holds a signature.
+# The most results that `once_for_each_signature` keeps for a function, and the most
+# functions of which `current_traces` keeps the calls.
 _MOST_REMEMBERED = 128
-# Numbers in the text of a function are data, so that others compile nothing, unless they
-# have at most this many binary digits: those like 2, 1/2 and 12 belong to formulas, and XLA
-# simplifies what is made with them.
+# A literal is a Python number in a trace, such as 0.7 for `0.7 * x`. Most literals are the
+# values of parameters. They become inputs of the program, so that another value does not
+# compile anew. Literals of at most this many binary digits stay in the program: numbers
+# such as 2, 1/2 and 12 belong to formulas, and XLA simplifies operations with them.
 _DIGITS_OF_FORMULAS = 2
-# Operations whose second argument XLA should know: it makes products and roots of powers.
+# Operations of which a literal as the second argument stays in the program, too: XLA turns
+# powers with a known exponent into products and roots.
 _KNOWN_SECOND = frozenset(["pow", "rem"])
 # Complex matrices and vectors with axes of up to this length are multiplied entry by entry.
-# On CPUs XLA calls a routine for each pair of them in a batch: the product of a 2 by 2
-# matrix and a vector takes 160 to 290 ns for each path, and its sums 4 ns; of two 8 by 8
-# matrices 440 to 530 and 220 to 310 ns.
+# On CPUs XLA calls a routine for each pair of them in a batch. For each path the routine
+# takes 160 to 290 ns for a 2 by 2 matrix and a vector, and 440 to 530 ns for two 8 by 8
+# matrices. Entry by entry the products take 4 ns and 220 to 310 ns.
 _LONGEST_AXIS = 8
 
 Result = TypeVar("Result")
 
 
 class Traced(eqx.Module):
-    """The user's function, as the program that it was when it was traced.
+    """A function of the user, as it was when it was traced.
 
-    - `program`: all of it but the values of arrays. Functions that compute the same have
-        one and the same program.
-    - `numbers`: the arrays that the function closes over or holds, and numbers in its text.
+    - `program`: the function without the values of its arrays. Functions that compute the
+        same have one and the same program.
+    - `numbers`: the values, in the order that `_Program` states.
     """
 
     program: "_Program" = eqx.field(static=True)
@@ -85,78 +89,88 @@ class Traced(eqx.Module):
 
     def __call__(self, *inputs: PyTree) -> PyTree:
         """The value of the function. The inputs have the structure and shapes of those for
-        which it was traced. What is no array in them is not read again."""
+        which it was traced. Their leaves that are not arrays are not read: the program
+        contains those for which it was traced."""
         return self.program.value(self.numbers, inputs)
 
 
 def traced(fn: Callable, *inputs: PyTree, identity: Any = None) -> Traced:
-    """The function as a program of inputs like these: arrays or their shapes, and what else
-    it takes, which is then part of the program. A `Traced` is returned as it is.
+    """Traces the function for inputs like these. The leaves of the inputs are arrays, their
+    shapes, or anything else, which becomes part of the program. A `Traced` is returned as
+    it is.
 
-    `identity` stands for code that a trace names, but does not contain, such as a callback
-    or the rule of a custom derivative: programs with such code are the same only for the
-    same `identity`. It is the user's function where `fn` is made anew around it in each
-    call, and by default `fn`."""
+    A trace names some code without containing it: callbacks, and rules of custom
+    derivatives. Programs with such code are the same only for the same `identity`, by
+    default `fn`. Where `fn` is made anew around a function of the user in each call, pass
+    the function of the user."""
     if isinstance(fn, Traced):
         return fn
     leaves, treedef = jtu.tree_flatten((fn, inputs))
-    is_array = [
-        eqx.is_array(leaf) or isinstance(leaf, jax.ShapeDtypeStruct) for leaf in leaves
-    ]
+    # Both lists are as long as `leaves`, with `None` for the leaves in the other list.
+    array_leaves, other_leaves = eqx.partition(leaves, _is_array_or_struct)
     # Set by `results` while it is traced.
     static_results = None
 
     # JAX keeps traces by the identity of functions. This function is new in each call of
     # `traced`, so that it is always traced.
-    def results(*arrays: Array) -> PyTree[Array]:
+    def results(arrays: list[Array | None]) -> PyTree:
         nonlocal static_results
-        remaining = iter(arrays)
-        all_leaves = [
-            next(remaining) if is_it else leaf for is_it, leaf in zip(is_array, leaves)
-        ]
+        all_leaves = eqx.combine(arrays, other_leaves)
         fn_with_arrays, traced_inputs = treedef.unflatten(all_leaves)
         result = fn_with_arrays(*traced_inputs)
-        dynamic, static_results = eqx.partition(result, eqx.is_array_like)
-        return dynamic
+        dynamic_results, static_results = eqx.partition(result, eqx.is_array_like)
+        return dynamic_results
 
-    arrays = [leaf for is_it, leaf in zip(is_array, leaves) if is_it]
-    make_jaxpr = jax.make_jaxpr(results, return_shape=True)
-    closed_jaxpr, struct_of_result = make_jaxpr(*arrays)
+    closed_jaxpr, struct = jax.make_jaxpr(results, return_shape=True)(array_leaves)
     jaxpr = closed_jaxpr.jaxpr
     jaxpr = jaxpr.replace(eqns=[*map(_with_sums_of_products, jaxpr.eqns)])
-    jaxpr, text_numbers = _numbers_apart(jaxpr)
-    # The leaves of the function come before those of the inputs. It has some if it is a
-    # Module, or a `jax.tree_util.Partial`.
-    fn_leaves = jtu.tree_leaves(fn)
-    fn_arrays = [leaf for leaf in fn_leaves if eqx.is_array(leaf)]
-    is_input_array = is_array[len(fn_leaves) :]
-    treedef_of_result = jtu.tree_structure(struct_of_result)
-    program = _Program(jaxpr, is_input_array, treedef_of_result, static_results)
-    # In the order of the constants and the first inputs of `jaxpr`.
-    consts = map(jnp.asarray, closed_jaxpr.consts)
-    numbers = [*consts, *text_numbers, *fn_arrays]
+    jaxpr, literals = _with_literals_as_constants(jaxpr)
+    # The leaves of `fn` come before those of the inputs.
+    num_fn_leaves = len(jtu.tree_leaves(fn))
+    fn_arrays = [x for x in array_leaves[:num_fn_leaves] if x is not None]
+    program = _Program(
+        jaxpr,
+        is_array=[x is not None for x in array_leaves[num_fn_leaves:]],
+        result_treedef=jtu.tree_structure(struct),
+        static_results=static_results,
+    )
+    numbers = [*map(jnp.asarray, closed_jaxpr.consts), *literals, *fn_arrays]
     return Traced(_interned(program, fn if identity is None else identity), numbers)
 
 
-class _Program:
-    """A function of arrays, hashed by identity.
+def _is_array_or_struct(x: Any) -> bool:
+    return eqx.is_array(x) or isinstance(x, jax.ShapeDtypeStruct)
 
-    - `jaxpr`: its program. The constants and the first inputs are the `numbers` of a
-        `Traced`.
-    - `is_array`: which leaves of the inputs of the function are arrays.
-    - `treedef`, `static`: the structure of what the function returns, and those of its
-        leaves that are not arrays.
+
+class _Program:
+    """A function of arrays, hashed by identity. Its arrays are, in this order:
+
+    1. the constants of the trace: arrays that the user's function closes over;
+    2. literals of the trace that were made constants;
+    3. arrays that the user's function holds, if it is a Module or a `jtu.Partial`;
+    4. arrays among the inputs of the user's function.
+
+    The `numbers` of a `Traced` are the first three.
+
+    - `jaxpr`: takes 1 and 2 as constants, 3 and 4 as inputs.
+    - `is_array`: which leaves of the inputs of the user's function are arrays.
+    - `result_treedef`, `static_results`: the structure of what the user's function returns,
+        and the leaves of it that are not arrays.
     - `fingerprint`: a hash of what it computes, the same in all processes; set by
         `_interned`.
     """
 
     def __init__(
-        self, jaxpr: Jaxpr, is_array: list[bool], treedef: Any, static: PyTree
+        self,
+        jaxpr: Jaxpr,
+        is_array: list[bool],
+        result_treedef: Any,
+        static_results: PyTree,
     ):
         self.jaxpr = jaxpr
         self.is_array = is_array
-        self.treedef = treedef
-        self.static = static
+        self.result_treedef = result_treedef
+        self.static_results = static_results
         self.fingerprint = ""
 
     # `digest` reads this, so that it must tell programs from each other in all processes.
@@ -164,7 +178,7 @@ class _Program:
         return self.fingerprint
 
     def value(self, numbers: list[Array], inputs: PyTree) -> PyTree:
-        """The value of the function, for the numbers of its `Traced`."""
+        """The value of the user's function, for the `numbers` of its `Traced`."""
         leaves = jtu.tree_leaves(inputs)
         arrays = [x for x, is_it in zip(leaves, self.is_array, strict=True) if is_it]
         num_consts = len(self.jaxpr.constvars)
@@ -174,22 +188,22 @@ class _Program:
             for x, variable in zip(args, self.jaxpr.invars, strict=True)
         ]
         results = evaluated(self.jaxpr, numbers[:num_consts], converted)
-        return eqx.combine(self.treedef.unflatten(results), self.static)
+        return eqx.combine(self.result_treedef.unflatten(results), self.static_results)
 
 
 def _with_dtype_of(aval: Any, x: Any) -> Array | np.ndarray:
-    # Times may be numbers of Python.
+    """`x` as an array of the dtype of `aval`. Times may be numbers of Python."""
     has_dtype = eqx.is_array(x) and x.dtype == aval.dtype
     return x if has_dtype else jnp.asarray(x, aval.dtype)
 
 
 def _with_sums_of_products(eqn: JaxprEqn) -> JaxprEqn:
-    """The operation itself, or in place of a product of small complex arrays the sums that
-    it consists of."""
+    """The operation itself; for a product of small complex arrays, an operation that adds
+    up the products of their entries."""
     if eqn.primitive.name != "dot_general":
         return eqn
-    arrays: list[Any] = [x.aval for x in eqn.invars]
-    structs = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arrays]
+    avals: list[Any] = [x.aval for x in eqn.invars]
+    structs = [jax.ShapeDtypeStruct(aval.shape, aval.dtype) for aval in avals]
     axes = [size for struct in structs for size in struct.shape]
     is_complex = any(jnp.issubdtype(x.dtype, jnp.complexfloating) for x in structs)
     if not is_complex or max(axes, default=0) > _LONGEST_AXIS:
@@ -198,6 +212,7 @@ def _with_sums_of_products(eqn: JaxprEqn) -> JaxprEqn:
     dtype = _dtype_of(result.aval)
     dimension_numbers = eqn.params["dimension_numbers"]
     sums = jax.jit(ft.partial(_sums_of_products, dimension_numbers, dtype))
+    # The trace of a function with `jit` is one operation, which calls it.
     [call] = jax.make_jaxpr(sums)(*structs).jaxpr.eqns
     return eqn.replace(primitive=call.primitive, params=call.params)
 
@@ -205,7 +220,7 @@ def _with_sums_of_products(eqn: JaxprEqn) -> JaxprEqn:
 def _sums_of_products(
     dimension_numbers: Any, dtype: Any, left: Array, right: Array
 ) -> Array:
-    """`jax.lax.dot_general` with a result of this dtype, entry by entry."""
+    """The result of `jax.lax.dot_general` in this dtype, as sums of products of entries."""
     (left_summed, right_summed), (left_batch, right_batch) = dimension_numbers
     num_batch = len(left_batch)
     num_summed = len(left_summed)
@@ -226,46 +241,51 @@ def _sums_of_products(
     return jnp.sum(left.astype(dtype) * right, axis=summed_axes, dtype=dtype)
 
 
-def _numbers_apart(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:
-    """The program with constants for numbers in its text, and these numbers."""
+def _with_literals_as_constants(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:
+    """The program with new constants in place of the literals that are likely the values of
+    parameters, and the values of these constants."""
     jaxpr = jaxpr.replace(eqns=[*map(_with_inverse_of_divisor, jaxpr.eqns)])
-    places = [
-        OperandPlace(k, position)
-        for k, eqn in enumerate(jaxpr.eqns)
-        for position, x in enumerate(eqn.invars)
-        if isinstance(x, Literal)
-        and _has_many_digits(x)
-        and not (position == 1 and eqn.primitive.name in _KNOWN_SECOND)
+    places = [*_parameters_in_operations(jaxpr), *_parameters_in_results(jaxpr)]
+    jaxpr, literals = with_constants_at(jaxpr, places)
+    return jaxpr, [jnp.asarray(x.val, x.aval.dtype) for x in literals]
+
+
+def _parameters_in_operations(jaxpr: Jaxpr) -> list[OperandPlace]:
+    """Where operations read the values of parameters."""
+    places = []
+    for k, eqn in enumerate(jaxpr.eqns):
+        for position, x in enumerate(eqn.invars):
+            stays_known = position == 1 and eqn.primitive.name in _KNOWN_SECOND
+            if _is_parameter(x) and not stays_known:
+                places.append(OperandPlace(k, position))
+    return places
+
+
+def _parameters_in_results(jaxpr: Jaxpr) -> list[OperandPlace]:
+    """Where the program returns values of parameters, such as a constant friction."""
+    # A literal such as 0.7 may have a weak type: its product with a float32 array has
+    # float32. A constant has no weak type: if it has float64, so has the product. Therefore
+    # the literal becomes a constant only if all inputs have its dtype.
+    input_dtypes = {_dtype_of(x.aval) for x in jaxpr.invars}
+    return [
+        OperandPlace(RESULTS, position)
+        for position, x in enumerate(jaxpr.outvars)
+        if _is_parameter(x) and input_dtypes == {_dtype_of(x.aval)}
     ]
-    numbers = [jaxpr.eqns[place.operation].invars[place.position] for place in places]
-    # A function may return a number of its text, such as a constant friction. In the text
-    # the number may be of a weak type, which takes the dtype of what it meets, and as data
-    # it is not. So it is data only where it can meet no other dtype: its own is that of all
-    # inputs.
-    dtypes = {_dtype_of(x.aval) for x in jaxpr.invars}
-    for position, x in enumerate(jaxpr.outvars):
-        if not isinstance(x, Literal) or dtypes != {_dtype_of(x.aval)}:
-            continue
-        if _has_many_digits(x):
-            places.append(OperandPlace(len(jaxpr.eqns), position))
-            numbers.append(x)
-    arrays = [jnp.asarray(x.val, x.aval.dtype) for x in numbers]  # pyright: ignore
-    return with_constants_at(jaxpr, places), arrays
 
 
 def _with_inverse_of_divisor(eqn: JaxprEqn) -> JaxprEqn:
-    """The operation itself, or in place of a division by a number a product with its
-    inverse, to which XLA turns it, too. Thus the number can be data at no cost."""
+    """The operation itself; for a division by the value of a parameter, the product with
+    its inverse. XLA makes the same of a division by a constant, so that the divisor can be
+    an input at no cost."""
     if eqn.primitive.name != "div":
         return eqn
     dividend, divisor = eqn.invars
-    if not isinstance(divisor, Literal):
-        return eqn
-    if not _has_many_digits(divisor):
+    if not _is_parameter(divisor):
         return eqn
     value = np.asarray(divisor.val)
     inverse = Literal(np.ones_like(value) / value, divisor.aval)
-    product = _product(divisor.aval.dtype)  # pyright: ignore (of an array)
+    product = _product(_dtype_of(divisor.aval))
     return eqn.replace(
         primitive=product.primitive,
         params=product.params,
@@ -274,16 +294,19 @@ def _with_inverse_of_divisor(eqn: JaxprEqn) -> JaxprEqn:
 
 
 @ft.cache
-def _product(dtype: Any) -> JaxprEqn:
-    """A product, as this version of JAX writes it."""
+def _product(dtype: str) -> JaxprEqn:
+    """The operation that multiplies two numbers, from this version of JAX."""
     struct = jax.ShapeDtypeStruct((), dtype)
     [eqn] = jax.make_jaxpr(jax.lax.mul)(struct, struct).jaxpr.eqns
     return eqn
 
 
-def _has_many_digits(number: Literal) -> bool:
-    """Whether a number is more likely the value of a parameter than part of a formula."""
-    value = np.asarray(number.val)
+def _is_parameter(x: Any) -> TypeGuard[Literal]:
+    """Whether an operand is a literal that is more likely the value of a parameter than
+    part of a formula."""
+    if not isinstance(x, Literal):
+        return False
+    value = np.asarray(x.val)
     if not np.issubdtype(value.dtype, np.floating) or not np.isfinite(value):
         return False
     # A mantissa of few binary digits becomes a whole number by a product with a small power
@@ -293,23 +316,23 @@ def _has_many_digits(number: Literal) -> bool:
     return scaled != round(scaled)
 
 
-# From what a program computes to the program, for as long as anything uses it.
+# All programs that anything uses, by what they compute.
 _known: weakref.WeakValueDictionary[Hashable, _Program] = weakref.WeakValueDictionary()
 _lock = threading.Lock()
 
 
 def _interned(program: _Program, identity: Any) -> _Program:
-    """The program that was known before if it computes the same, and otherwise this one.
-    `identity` is as for `traced`."""
+    """The known program that computes the same as this one. If there is none, this one is
+    returned, and known from now on. `identity` is as for `traced`."""
     only_named: list[Any] = []
     description = (
         _description(program.jaxpr, only_named),
         tuple(program.is_array),
-        program.treedef,
-        static_part(program.static),
+        program.result_treedef,
+        static_part(program.static_results),
     )
-    # What a custom derivative or a callback computes is named in a trace, not written out.
-    # Then only the same function has the same program.
+    # Code that is only named cannot be compared. Then only the same function has the same
+    # program.
     key = description, static_part(identity) if only_named else None
     with _lock:
         known = _known.setdefault(key, program)
@@ -319,34 +342,38 @@ def _interned(program: _Program, identity: Any) -> _Program:
 
 
 def _description(jaxpr: Jaxpr, only_named: list[Any]) -> Hashable:
-    """All that a program computes: equal for equal programs, since variables are numbered
-    as they appear. What a trace names, but does not write out, such as callbacks, is
-    appended to `only_named`."""
+    """All that a program computes. Equal programs have equal descriptions, since variables
+    are numbered in the order in which they appear. Code that the program names without
+    containing it, such as a callback, is appended to `only_named`."""
     number_of: dict[Any, int] = {}
-    # By identity, since most operations share one context, whose text is long.
+    # From the identity of a context, the settings for an operation, to its text. The text
+    # is long, and most operations share one context.
     contexts: dict[int, str] = {}
 
-    def variable(x: Any) -> Hashable:
+    def described(x: Any) -> Hashable:
+        """The value of a literal, or the number of a variable."""
         if isinstance(x, Literal):
             return _type_of(x.aval), np.asarray(x.val).tobytes()
         return number_of.setdefault(x, len(number_of))
 
     inputs = [
-        (variable(x), _type_of(x.aval)) for x in (*jaxpr.constvars, *jaxpr.invars)
+        (described(x), _type_of(x.aval)) for x in (*jaxpr.constvars, *jaxpr.invars)
     ]
     operations = []
     for eqn in jaxpr.eqns:
-        context = contexts.setdefault(id(eqn.ctx), str(eqn.ctx))
-        operands = tuple(map(variable, eqn.invars))
-        results = tuple(map(variable, eqn.outvars))
+        if id(eqn.ctx) not in contexts:
+            contexts[id(eqn.ctx)] = str(eqn.ctx)
+        context = contexts[id(eqn.ctx)]
+        operands = tuple(map(described, eqn.invars))
+        results = tuple(map(described, eqn.outvars))
         params = _description_of_value(eqn.params, only_named)
         operations.append((eqn.primitive, context, operands, params, results))
-    outputs = tuple(map(variable, jaxpr.outvars))
+    outputs = tuple(map(described, jaxpr.outvars))
     return tuple(inputs), tuple(operations), outputs
 
 
 def _type_of(aval: Any) -> tuple[tuple[int, ...], str, bool]:
-    """The shape, the dtype, and whether other dtypes prevail."""
+    """The shape, the dtype, and whether the type is weak."""
     return aval.shape, str(aval.dtype), getattr(aval, "weak_type", False)
 
 
@@ -356,9 +383,9 @@ def _dtype_of(aval: Any) -> str:
 
 
 def _description_of_value(x: Any, only_named: list[Any]) -> Hashable:
-    """A parameter of an operation, as in `_description`."""
+    """The value of a parameter of an operation, as a part of `_description`."""
     if is_program(x):
-        # The arrays that a program within the function closes over are part of it.
+        # Arrays that an inner program closes over are part of the description.
         consts = x.consts if isinstance(x, ClosedJaxpr) else ()
         values = tuple(_description_of_value(const, only_named) for const in consts)
         jaxpr: Any = x.jaxpr if isinstance(x, ClosedJaxpr) else x
@@ -374,6 +401,7 @@ def _description_of_value(x: Any, only_named: list[Any]) -> Hashable:
     if isinstance(x, float | complex):
         # Zeros of both signs are equal, and NaN is not equal to itself.
         return type(x), repr(x)
+    # Functions, and values that cannot be compared, count by their type.
     if is_rule(x) or not _is_hashable(x):
         only_named.append(x)
         return type(x)
@@ -382,10 +410,11 @@ def _description_of_value(x: Any, only_named: list[Any]) -> Hashable:
 
 def _array_value(x: Array | np.ndarray | np.generic) -> Hashable:
     """The values of an array, with its shape and dtype."""
-    words = x
+    values = x
+    # NumPy cannot read random keys.
     if isinstance(x, Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
-        words = jax.random.key_data(x)
-    return x.shape, str(x.dtype), np.asarray(words).tobytes()
+        values = jax.random.key_data(x)
+    return x.shape, str(x.dtype), np.asarray(values).tobytes()
 
 
 def _is_hashable(x: Any) -> bool:
@@ -397,7 +426,7 @@ def _is_hashable(x: Any) -> bool:
 
 
 class _ByIdentity:
-    """A value that is equal to itself only, whether or not it has a hash of its own."""
+    """A value that is equal to itself only. It need not have a hash."""
 
     def __init__(self, value: Any):
         self.value = value
@@ -410,7 +439,8 @@ class _ByIdentity:
 
 
 def static_part(tree: PyTree) -> Hashable:
-    """A PyTree without the values of its arrays: their shapes and dtypes, and all else."""
+    """A key for a PyTree without the values of its arrays: the shapes and dtypes of the
+    arrays, and all else."""
     leaves, treedef = jtu.tree_flatten(tree)
     if not _is_hashable(treedef):
         return _ByIdentity(tree)
@@ -419,8 +449,9 @@ def static_part(tree: PyTree) -> Hashable:
 
 def _static_leaf(leaf: Any) -> Hashable:
     if eqx.is_array(leaf):
-        # Traces tell JAX's arrays of weak types from others.
+        # Arrays of NumPy have no weak types.
         return leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)
+    # A bound method has no hash if its object has none, such as a Module with arrays.
     if isinstance(leaf, types.MethodType) and not _is_hashable(leaf):
         return _ByIdentity(leaf.__self__), leaf.__func__
     # `1`, `1.0` and `True` are equal, but not the same input.
@@ -428,7 +459,7 @@ def _static_leaf(leaf: Any) -> Hashable:
 
 
 class _Remembered:
-    """Values by their keys. The `max_size` that were used last are kept."""
+    """A cache. The `max_size` values that were used last are kept."""
 
     def __init__(self, max_size: int):
         self._max_size = max_size
@@ -436,7 +467,7 @@ class _Remembered:
         self._lock = threading.Lock()
 
     def get(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """The value of this key, from `make` if it is not there."""
+        """The value of this key. If there is none, `make` makes it."""
         with self._lock:
             if key in self._values:
                 self._values.move_to_end(key)
@@ -461,49 +492,45 @@ def compiled(fn: Callable[..., Result], quickly: bool = False) -> Callable[..., 
     """`equinox.filter_jit(fn)` for functions that return arrays, which drops programs when
     many others were used since.
 
-    With `quickly` they are compiled by XLA's older generator of code for CPUs, where this
-    version of XLA has it. The program of a fit takes 2.6 to 5 s of processor time to
-    compile by the newer generator, and 1.8 to 3.2 s by the older one. Both programs run at
-    the same speed."""
+    With `quickly`, XLA's older generator of code for CPUs compiles them, where this version
+    of XLA has it. The program of a fit takes 2.6 to 5 s of processor time to compile by the
+    newer generator, and 1.8 to 3.2 s by the older one. Both programs run at the same
+    speed."""
 
-    # Not by `eqx.filter_jit`, whose cache would keep the programs that are dropped here.
     options = quick_options() if quickly else {}
 
+    # Not by `eqx.filter_jit`, whose cache would keep the programs that are dropped here.
     @ft.wraps(fn)
     def call(*args: Any) -> Result:
         leaves, treedef = jtu.tree_flatten(args)
-        is_array = [eqx.is_array(leaf) for leaf in leaves]
-        arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
-        others = [None if eqx.is_array(leaf) else leaf for leaf in leaves]
+        # Both lists are as long as `leaves`, with `None` for the leaves in the other list.
+        array_leaves, other_leaves = eqx.partition(leaves, eqx.is_array)
 
-        def of_arrays(arrays: list[Array]) -> Result:
-            remaining = iter(arrays)
-            all_leaves = [
-                next(remaining) if is_it else other
-                for is_it, other in zip(is_array, others)
-            ]
-            return fn(*treedef.unflatten(all_leaves))
+        def of_arrays(arrays: list[Array | None]) -> Result:
+            return fn(*treedef.unflatten(eqx.combine(arrays, other_leaves)))
 
         jitted = ft.partial(jax.jit, of_arrays, compiler_options=options)
-        key = fn, quickly, treedef, tuple(is_array), static_part(others)
+        key = fn, quickly, treedef, static_part(other_leaves)
         try:
-            return _programs.get(key, jitted)(arrays)
+            return _programs.get(key, jitted)(array_leaves)
         except ValueError as error:
-            # So JAX refuses options of the compiler for a program inside of another, or one
+            # JAX refuses options of the compiler for a program inside of another, or one
             # that captures values of another. It has no class of errors for this.
             if "`compiler_options`" not in str(error):
                 raise
-        # There the options of the other program apply.
+        # The options of the outer program apply.
         without_options = compiled(fn)
         return without_options(*args)
 
     return call
 
 
-# The user's functions that are called while a trace is made, with their inputs.
-_calls: contextvars.ContextVar[dict[Hashable, tuple[Any, ...]] | None]
+# A function of the user and its inputs, as the arguments of `traced`.
+_Call: TypeAlias = tuple[Any, ...]
+# The calls inside a context of `current_traces`; outside of such contexts `None`.
+_calls: contextvars.ContextVar[dict[Hashable, _Call] | None]
 _calls = contextvars.ContextVar("calls", default=None)
-_numbers_of_traces = itertools.count(1)
+_new_numbers = itertools.count(1)
 
 
 def note_call(fn: Callable, *inputs: PyTree) -> None:
@@ -518,19 +545,20 @@ def _struct_of_array(x: Any) -> Any:
     return jax.ShapeDtypeStruct(x.shape, x.dtype) if eqx.is_array(x) else x
 
 
-class _Watched(NamedTuple):
-    """A trace that JAX may use again.
+class _NumberedTraces(NamedTuple):
+    """The traces that JAX keeps from contexts of one number.
 
-    - `number`: the argument of `with_traces_of` with which it was made.
-    - `calls`: for each call of a function of the user in it, the arguments of `traced`, and
-        the program that it was then.
+    - `number`: the argument of `with_traces_of`.
+    - `calls`: the calls of the user's functions in these traces, each with the function as
+        it was then.
     """
 
     number: int
-    calls: list[tuple[tuple[Any, ...], Traced]]
+    calls: list[tuple[_Call, Traced]]
 
-    def is_current(self) -> bool:
-        """Whether all functions still compute the same."""
+    def are_current(self) -> bool:
+        """Whether the user's functions still compute the same. `False` if there are too
+        many calls to find out."""
         if len(self.calls) > _MOST_CALLS:
             return False
         return all(
@@ -538,44 +566,59 @@ class _Watched(NamedTuple):
         )
 
 
-_watched = _Remembered(_MOST_REMEMBERED)
+# For each function that was passed to `current_traces`.
+_numbered_traces = _Remembered(_MOST_REMEMBERED)
 
 
 @contextlib.contextmanager
 def current_traces(fn: Callable) -> Iterator[None]:
-    """A context in which to trace a function of the user that solves equations. JAX keeps
-    traces of `diffrax.diffeqsolve` by the identity of the functions in its terms: they are
-    used again while these functions compute the same, since they take a second to make."""
+    """A context in which to trace `fn`, a function of the user that solves equations.
+
+    JAX keeps the traces of `diffrax.diffeqsolve` by the identity of the functions in its
+    terms, and uses them again even if these functions compute something else by then. A
+    trace takes a second to make, so it should be used again while nothing has changed:
+
+    1. The context has a number. JAX uses only traces from contexts of the same number.
+    2. Inside the context, `note_call` records the user's functions that are called.
+    3. At the end, each of these functions is traced alone, and stored with the number.
+    4. The next context for `fn` traces these functions again. If they compute the same, it
+        has the same number. Otherwise it has a new one, for which JAX has no traces."""
     key = static_part(fn)
-    watched = _watched.get(key, lambda: None)
-    if watched is None or not watched.is_current():
-        # JAX has no traces of a new number, so it traces anew.
-        watched = _Watched(next(_numbers_of_traces), [])
-    calls: dict[Hashable, tuple[Any, ...]] = {}
+    traces = _numbered_traces.get(key, lambda: None)
+    if traces is None or not traces.are_current():
+        traces = _NumberedTraces(number=next(_new_numbers), calls=[])
+    calls: dict[Hashable, _Call] = {}
     token = _calls.set(calls)
     try:
-        with with_traces_of(watched.number):
+        with with_traces_of(traces.number):
             yield
     finally:
         _calls.reset(token)
-    new_calls = []
-    for call in calls.values():
-        # A function that `fn` makes from values of its trace cannot be called after it, or
-        # returns what depends on them. It need not be watched, since each trace makes
-        # another one.
+    # Functions in a trace that JAX used again were not called this time. So the calls from
+    # earlier contexts are kept.
+    all_calls = [*traces.calls, *_with_functions_of_now(calls.values())]
+    _numbered_traces.put(key, _NumberedTraces(traces.number, all_calls))
+
+
+def _with_functions_of_now(calls: Iterable[_Call]) -> Iterator[tuple[_Call, Traced]]:
+    """The calls that can be made again later, each with its function as it is now."""
+    for call in calls:
+        # A function that `fn` makes from values of its trace cannot be called after the
+        # trace, or returns what depends on these values. It need not be compared, since
+        # each trace makes another one.
         try:
             program = traced(*call)
         except jax.errors.UnexpectedTracerError:
             continue
         if not any(map(is_traced, program.numbers)):
-            new_calls.append((call, program))
-    _watched.put(key, _Watched(watched.number, [*watched.calls, *new_calls]))
+            yield call, program
 
 
 def once_for_each_signature(fn: Callable[..., Result]) -> Callable[..., Result]:
-    """A function that reads no values of arrays in its arguments, and is called once for
-    each structure, shapes and dtypes of these. Tracing anew takes longer than a short
-    ensemble: the checks of shapes took 5 of 11 ms for 64 paths."""
+    """Decorates a function that reads no values of arrays in its arguments. It is called
+    once for each structure, shapes and dtypes of its arguments, and the result is
+    remembered. To trace anew takes longer than a short ensemble: the checks of shapes took
+    5 of 11 ms for 64 paths."""
     remembered = _Remembered(_MOST_REMEMBERED)
 
     @ft.wraps(fn)
@@ -588,13 +631,14 @@ def once_for_each_signature(fn: Callable[..., Result]) -> Callable[..., Result]:
 
 def digest(tree: PyTree) -> str:
     """A hash of all values in a PyTree, the same in all processes with the same versions of
-    packages. Functions that were not traced count by their names."""
+    packages. Functions count by their names, unless they are in a `Traced`."""
     leaves, treedef = jtu.tree_flatten(tree)
     values = [_array_value(x) if eqx.is_array(x) else repr(x) for x in leaves]
     return _hash(_without_addresses(repr((treedef, values))))
 
 
 def _without_addresses(text: str) -> str:
+    """The text without addresses of objects, which differ between processes."""
     return re.sub(r" at 0x[0-9a-f]+", "", text)
 
 

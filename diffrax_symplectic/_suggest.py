@@ -72,11 +72,13 @@ from ._terms import (
 )
 
 
-# The suggested solvers, best first: by order; then those that give stiff modes the right
-# energy; then by the size of the equations of a step. In a heat bath those for friction are
-# the first for means: most of these are of functions of positions, whose stationary law
-# is exact for harmonic modes.
+# The suggested solvers, best first. They are ranked by order, then by whether they give
+# stiff modes the right energy, then by the size of the equations of a step.
+#
+# Solvers for heat baths. For means they come before all others: most means are of functions
+# of positions, of which these solvers have the exact stationary law for harmonic modes.
 FOR_FRICTION = (BAOAB, LangevinMiddle)
+# Solvers for means. `_ranked_for_means` makes exceptions to the order.
 FOR_MEANS = (
     AdditiveGauss,
     StormerVerlet,
@@ -87,6 +89,7 @@ FOR_MEANS = (
     SRKw4,
     SRKw1,
 )
+# Solvers for single paths.
 FOR_PATHS = (
     PlateauVerlet,
     SRKs4,
@@ -97,11 +100,12 @@ FOR_PATHS = (
     LevyAreaMidpoint,
     ImplicitMidpoint,
 )
-# At the cost of a hundred steps of the midpoint rule, `NinomiyaVictoir` had 0.1, 0.16, 0.14
-# and 1.2 times its error for 2, 3, 4 and 6 noises of linear systems with two or three
-# degrees of freedom.
+# `NinomiyaVictoir` takes a flow for each noise. At the cost of a hundred steps of the
+# midpoint rule, it had 0.1, 0.16, 0.14 and 1.2 times the error of that rule for 2, 3, 4 and
+# 6 noises of linear systems with two or three degrees of freedom.
 _MOST_FLOWS_OF_NOISE = 4
-# The solver for a heat bath whose Hamiltonian is any that is quadratic in the momenta.
+# The solver for heat baths with any Hamiltonian that is quadratic in the momenta, such as
+# one with masses that depend on positions.
 _BATH_OF_ANY_ENERGY = BAOAB(ImplicitMidpoint())
 
 
@@ -114,9 +118,9 @@ class Suggestion:
         method is `None`.
     - `path`: the Brownian path that it needs, as code.
     - `reason`: when to choose it, in a sentence.
-    - `terms`: a function of a random key that returns the terms of the system with such
-        paths. Paths of given noise, such as a record, are not replaced. A path of a class
-        of your own, such as one of random kicks, is kept, with another key.
+    - `terms`: a function of a random key that returns the terms of the system with paths
+        that the solver needs. Paths of given noise, such as a record, are not replaced. A
+        path of a class of your own, such as one of random kicks, is kept, with another key.
     """
 
     solver: AbstractSymplecticSolver
@@ -185,14 +189,17 @@ def suggest_solver(
         print(ds.suggest_solver(terms, 0.0, y0, want="weak"))
         ```
 
-    The structure is traced, nothing is solved. Stiffness cannot be seen: if the first is
-    explicit and needs too many steps, take the next implicit one. Whether noises commute is
-    tested at random states, which is no proof.
+    The structure is traced, nothing is solved. Stiffness cannot be seen: if the first
+    solver is explicit and needs too many steps, take the next implicit one. Whether noises
+    commute is tested at random states, which is no proof.
 
-    They are ranked by order; then those that give stiff modes the right energy come first;
-    then by the size of the equations of a step. With friction, those with exact stationary
-    positions come first for means, and if masses depend on positions
-    `BAOAB(ImplicitMidpoint())`. `NinomiyaVictoir` comes last with more than four noises.
+    Solvers are ranked by order, then by whether they give stiff modes the right energy,
+    then by the size of the equations of a step. There are exceptions:
+
+    - With friction, solvers with exact stationary positions come first for means.
+    - With friction and masses that depend on positions, `BAOAB(ImplicitMidpoint())` comes
+        first.
+    - With more than four noises, `NinomiyaVictoir` comes last.
 
     **Arguments:**
 
@@ -231,11 +238,10 @@ def suggest_solver(
     for solver in _suitable(system, want, paths, one_term=len(noise) == 1):
         assert solver.record is not None
         is_implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+        make_path = ft.partial(own_path, solver, want)
+        which_truncated = tuple(is_implicit and needed for needed in needs_truncation)
         terms_of_key = ft.partial(
-            _terms_with_paths,
-            ft.partial(own_path, solver, want),
-            numbers,
-            tuple(is_implicit and needed for needed in needs_truncation),
+            _terms_with_paths, make_path, numbers, which_truncated
         )
         suggestion = Suggestion(
             solver=solver,
@@ -262,26 +268,26 @@ def _terms_with_paths(
     terms: diffrax.AbstractTerm,
     key: PRNGKeyArray,
 ) -> diffrax.AbstractTerm:
-    """The terms with paths made by `make_path` for this key, and truncation in those whose
-    flag in `which_truncated` is true. `numbers` are the `motion_numbers` of the random
-    paths."""
+    """The terms with paths that `make_path` makes from this key, of which those with a true
+    flag in `which_truncated` are truncated. `numbers` are the `motion_numbers` of the
+    random paths."""
     return with_truncation(with_paths(make_path, numbers, terms, key), which_truncated)
 
 
 class System(NamedTuple):
     """What decides which solvers suit a system.
 
-    - `structures`: the structures that it has, beside `"any"`.
-    - `commute`: whether its noises commute, as far as is known.
-    - `num_noises`: the number of its scalar Brownian motions.
-    - `fault`: why it is not separable; `None` if it is.
-    - `friction`: whether it has friction that solvers for heat baths, such as `BAOAB()`,
-        treat by a step of its own.
-    - `general_bath`: whether it has friction that only `BAOAB(ImplicitMidpoint())` treats
-        by a step of its own, as for masses that depend on positions.
-    - `friction_in_drift`: whether it has friction that no solver treats by a step of its
-        own, as beside noise that is not in the forces: all have it in the drift.
-    - `constrained`: whether its positions are constrained.
+    - `structures`: the structures of the system, beside `"any"`.
+    - `commute`: whether the noises commute, as far as is known.
+    - `num_noises`: the number of scalar Brownian motions.
+    - `fault`: why the system is not separable; `None` if it is.
+    - `friction`: whether there is friction that solvers for heat baths, such as `BAOAB()`,
+        treat apart from the drift.
+    - `general_bath`: whether there is friction that only `BAOAB(ImplicitMidpoint())` treats
+        apart from the drift, as for masses that depend on positions.
+    - `friction_in_drift`: whether there is friction that all solvers treat as a part of the
+        drift, as beside noise that is not in the forces.
+    - `constrained`: whether the positions are constrained.
     """
 
     structures: Collection[Structure]
@@ -295,7 +301,7 @@ class System(NamedTuple):
 
     def in_a_sentence(self) -> str:
         """The structure of the system, such as "The system is separable, with friction and
-        one noise.", and what the user could change to have more solvers."""
+        one noise.", and what the user could change to get more solvers."""
         parts = "one noise"
         if self.num_noises > 1:
             how = "commute" if self.commute else "do not commute"
@@ -312,7 +318,7 @@ class System(NamedTuple):
         description = f"The system is {structure}, with {parts}."
         if fault is None or self.friction:
             return description
-        # A user who reads this may want one of the solvers that are not suggested.
+        # A user who wants a solver that is not suggested can read here why it is not.
         if self.structures and fault.wrong_way_round:
             description += f" It is not separable: {reason}."
         if fault.friction:
@@ -323,7 +329,7 @@ class System(NamedTuple):
 def _inspect(
     drift: Terms, noise: Terms, t0: Array, y0: Y, args: Args, constrained: bool
 ) -> System:
-    """The structure of the system, found by tracing its terms."""
+    """The system, as it is found by tracing its terms."""
     fault = separable_fault(drift, noise, t0, y0, args)
     structures: list[Structure] = [] if fault else ["separable"]
     if additive_fault(noise, t0, y0, args) is None:
@@ -334,8 +340,8 @@ def _inspect(
     num_noises = number_of_noises(terms)
     # Noise in the forces commutes, whatever the drift is.
     noise_in_forces = separable_fault((), noise, t0, y0, args) is None
-    # Noises are compared at random states only if nothing else decides, since that compiles
-    # a program.
+    # `noises_commute` comes last, since it compiles a program, which compares the noises at
+    # random states.
     commute = (
         num_noises == 1
         or len(structures) > 0
@@ -382,15 +388,16 @@ def _suitable(
                 "noise Hamiltonians H_k = U_k(t, q), and friction only from "
                 "`langevin_terms`."
             )
-    if not one_term or not jtu.all_leaves([increment_struct(paths[0])]):
-        # Lévy areas are only sampled between the noises of one array.
+    # Lévy areas are sampled only between noises that are entries of one array.
+    are_one_array = one_term and jtu.all_leaves([increment_struct(paths[0])])
+    if not are_one_array:
         solvers = [
             solver
             for solver in solvers
             if "noise brackets" not in map(drives, solver.variables)
         ]
-    # Given noise, and paths whose law is not known, are not replaced by paths of a solver,
-    # so only solvers that find their random variables in these are suitable.
+    # Given noise, and paths whose law is not known, are not replaced by paths of a solver.
+    # They must have the random variables of the solver.
     kept = [path for path in paths if not is_random(path) or has_unknown_law(path)]
     return [
         solver
@@ -403,7 +410,7 @@ def _has_variables_for(
     path: diffrax.AbstractBrownianPath, solver: AbstractSymplecticSolver
 ) -> bool:
     """Whether a given path has the random variables that the solver needs."""
-    # The class of increments, by the name that paths of Diffrax have for it.
+    # `levy_area` is Diffrax's name for the class of the increments of a path.
     increment = getattr(path, "levy_area", diffrax.AbstractBrownianIncrement)
     return solver.variables == ("W",) or issubclass(increment, solver.minimal_levy_area)
 
@@ -431,8 +438,7 @@ def accepts_friction(
     args: Args,
     solver: BAOAB,
 ) -> bool:
-    """Whether these are Langevin terms that this `BAOAB` accepts: that it raises no
-    `ValueError` for, of any kind."""
+    """Whether these are Langevin terms that this `BAOAB` accepts without a `ValueError`."""
     try:
         solver.check(terms, t0, y0, args)
     except ValueError:
@@ -442,40 +448,40 @@ def accepts_friction(
 
 def ranked(want: Want, system: System) -> list[AbstractSymplecticSolver]:
     """The suggested solvers for such a system, best first."""
+    kinds = _ranked_for_means(system) if want == "weak" else FOR_PATHS
+    solvers = [kind() for kind in kinds if _suits(kind, system)]
+    return [_BATH_OF_ANY_ENERGY, *solvers] if system.general_bath else solvers
+
+
+def _ranked_for_means(system: System) -> list[type[AbstractSymplecticSolver]]:
+    """The solvers for means, best first for such a system. Not all of them suit it."""
+    first: list[type[AbstractSymplecticSolver]] = [*FOR_FRICTION]
+    last: list[type[AbstractSymplecticSolver]] = []
+    if system.friction or system.friction_in_drift:
+        # For harmonic modes `SRKw1` has exact stationary means at every step size.
+        first.append(SRKw1)
+    if system.num_noises > _MOST_FLOWS_OF_NOISE:
+        last.append(NinomiyaVictoir)
+    others = [kind for kind in FOR_MEANS if kind not in first and kind not in last]
+    return [*first, *others, *last]
+
+
+def _suits(kind: type[AbstractSymplecticSolver], system: System) -> bool:
+    """Whether solvers of this class are for such a system."""
+    if kind in FOR_FRICTION:
+        return system.friction
     structures = {"any", *system.structures}
     if {"separable", "constant"} <= structures:
         structures.add("separable and constant")
     noises = ("any", "commuting" if system.commute else "not commuting")
-
-    def is_suitable(kind: type[AbstractSymplecticSolver]) -> bool:
-        if kind in FOR_FRICTION:
-            return system.friction
-        solver = kind()
-        assert solver.record is not None
-        return solver.structure in structures and solver.record.noises in noises
-
-    kinds = list(filter(is_suitable, FOR_MEANS if want == "weak" else FOR_PATHS))
-    if want == "weak":
-        if NinomiyaVictoir in kinds and system.num_noises > _MOST_FLOWS_OF_NOISE:
-            # It takes one flow for each noise, so it comes last.
-            kinds.remove(NinomiyaVictoir)
-            kinds.append(NinomiyaVictoir)
-        if system.friction or system.friction_in_drift:
-            # It comes before these: at every step size it has the exact stationary means of
-            # harmonic modes.
-            kinds.remove(SRKw1)
-            kinds.insert(0, SRKw1)
-        if system.friction:
-            kinds = [*FOR_FRICTION, *kinds]
-    best_first: list[AbstractSymplecticSolver] = [kind() for kind in kinds]
-    if system.general_bath:
-        best_first.insert(0, _BATH_OF_ANY_ENERGY)
-    return best_first
+    solver = kind()
+    assert solver.record is not None
+    return solver.structure in structures and solver.record.noises in noises
 
 
 def _code(solver: AbstractSymplecticSolver, module: str = "") -> str:
-    """The code that constructs the solver, such as `BAOAB(ImplicitMidpoint())`, with the
-    prefix `module` for each name."""
+    """The code that constructs the solver, such as `BAOAB(ImplicitMidpoint())`. Names have
+    the prefix `module`."""
     flow = ""
     if isinstance(solver, BAOAB) and is_solver(solver.flow):
         flow = _code(solver.flow, module)  # pyright: ignore
@@ -488,16 +494,17 @@ def _path_code(
     terms: diffrax.AbstractTerm,
     needs_bounded: bool,
 ) -> str:
-    """The path of a suggestion: the code that makes it, or in words which path of the terms
-    is kept. Of several paths that are made, which can differ only in their shapes, it is
-    the first."""
+    """Describes the path of a suggestion: by the code that makes it, or in words if the
+    path of the terms is kept. If several paths are made, which differ only in their shapes,
+    the code makes the first. `needs_bounded` says whether a path needs bounded
+    increments."""
     random_noise = random_paths(terms)
     replaceable = [path for path in random_noise if not has_unknown_law(path)]
     if replaceable:
         struct = increment_struct(replaceable[0])
         shape = _shape_code(struct)
-        # `solver.path` truncates without knowing the terms. Where they need no bounds, the
-        # code makes the same path without truncation. An example tells which path it makes.
+        # `solver.path` does not know the terms, and truncates increments in case they must
+        # be bounded. If they need not be, the code makes the same path without truncation.
         example = solver.path(struct, jr.key(0), want=want)
         if isinstance(example, TruncatedBrownianPath) and not needs_bounded:
             return f"ds.FixedStepBrownianPath({shape}, key)"
@@ -509,7 +516,7 @@ def _path_code(
 
 def _shape_code(shape: PyTree[jax.ShapeDtypeStruct]) -> str:
     """The code for the shape of a path, such as `(3,)`."""
-    # A PyTree of shapes has no short code.
+    # The code for a PyTree of shapes would be long, so that a name stands for it.
     if not isinstance(shape, jax.ShapeDtypeStruct):
         return "shape"
     if shape.dtype == jnp.result_type(float):

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, PyTree
 from ._arguments import check_pair, check_state
 from ._compat import ω
 from ._custom_types import Args, RealScalarLike, Y
+from ._products import dot
 from ._terms import (
     apply_one,
     as_spins,
@@ -37,7 +38,7 @@ from ._terms import (
 
 def _one_step(terms, solver, t0, t1, y0, args) -> tuple[Y, diffrax.RESULTS]:
     """The end of one step, and whether it succeeded."""
-    # Programs do not tell which functions they come from.
+    # Before `with_programs`, since programs do not tell which functions they come from.
     check_drifts_differ(terms)
     terms = with_programs(terms, t0, y0, args)
     solver = with_programs(solver, t0, y0, args)
@@ -100,18 +101,19 @@ def symplecticity_defect(
     identity = np.eye(half)
     omega = np.block([[zero, identity], [-identity, zero]])
     omega = jnp.asarray(omega, flat.dtype)
-    defect = _dot(jacobian.T, _dot(omega, jacobian)) - omega
+    # In full precision: rounded factors would look like a defect.
+    defect = dot(jacobian.T, dot(omega, jacobian)) - omega
     if constraint_of(terms) is not None:
         # The columns of Z are an orthonormal basis of the allowed directions.
         Z = _allowed_directions(terms, t0, y0, args)
-        defect = _dot(Z.T, _dot(defect, Z))
+        defect = dot(Z.T, dot(defect, Z))
     return jnp.max(jnp.abs(defect))
 
 
 def _allowed_directions(terms, t0, y0: Y, args: Args) -> Float[Array, "n k"]:
-    """An orthonormal basis, in columns, of the directions along which a state can move that
-    satisfies constraint(q) = 0 and J v = 0, with the Jacobian J of the constraint and the
-    velocities v."""
+    """An orthonormal basis of the directions along which an allowed state can move, in
+    columns. A state is allowed if constraint(q) = 0 and J v = 0, with the Jacobian J of the
+    constraint and the velocities v."""
     surface = Surface.of(with_programs(terms, t0, y0, args), t0, y0, args)
     flat, _ = jfu.ravel_pytree(y0)
 
@@ -122,15 +124,11 @@ def _allowed_directions(terms, t0, y0: Y, args: Args) -> Float[Array, "n k"]:
         return jnp.concatenate([residual, J_v])
 
     # The allowed directions are orthogonal to the gradients of the equations. The rows of
-    # V^T are orthonormal: the first ones, as many as there are equations, span the
-    # gradients, and all others the allowed directions.
+    # V^T are orthonormal. The first ones, as many as there are equations, span the
+    # gradients. The others span the allowed directions.
     gradients = jax.jacrev(equations)(flat)
     _, _, V_transposed = jnp.linalg.svd(gradients, full_matrices=True)
     return V_transposed[len(gradients) :].T
-
-
-# By default accelerators multiply in half precision, which would look like a defect.
-_dot = ft.partial(jnp.matmul, precision=jax.lax.Precision.HIGHEST)
 
 
 def poisson_defect(
@@ -185,11 +183,11 @@ def poisson_defect(
     def as_matrix(rows: Array) -> Array:
         return rows.reshape(num_components, num_components)
 
-    # P(s) is never formed: since P(s) v = s x v, the cross products of s with the rows of a
-    # matrix M are the columns of P(s) M^T. This is used with M = J and M = 1.
+    # P(s) is never formed. Since P(s) v = s x v, the cross products of s with the rows of a
+    # matrix M are the columns of P(s) M^T, here for M = J and for the identity M.
     J = as_matrix(gradients)
     P_Jt = as_matrix(jnp.cross(s0, gradients)).T
-    J_P_Jt = _dot(J, P_Jt)
+    J_P_Jt = dot(J, P_Jt)
     P_s1 = as_matrix(jnp.cross(s1, unit_vectors)).T
     return jnp.max(jnp.abs(J_P_Jt - P_s1))
 
