@@ -1,15 +1,15 @@
 """Paths with control variates from fitted value functions.
 
-- `value_functions`: the sampling. A trial decides where the fit is used.
+- `value_functions`: the sampling. A trial decides for which means the fit is used.
 - `noise`: the random variables of a step, and expectations over them.
-- `bases`, `grid`: the functions that are fitted; `polynomials`: what both are made of;
-  `basis_choice`: which of them.
+- `bases`, `grid`: the functions that are fitted, both made of `polynomials`.
+- `basis_choice`: which of these bases a problem gets.
 - `fits`: value functions, from a pilot run and a loop backward in time.
 - `controlled_paths`: paths, and their control variates.
-- `mixture`: the laws of the noise of paths, by which rare ones are common.
+- `mixture`: the laws by which paths draw their noise, so that rare paths are common.
 
-Axes of arrays, beside those of `_simulation/problem.py`: `P` polynomials, `K` outcomes of a
-step. Of random variables there are `n` as well.
+Axes of arrays are named as in `_simulation/problem.py`. In addition there are `P`
+polynomials and `K` outcomes of a step, and `n` stands for random variables as well.
 """
 
 from .basis_choice import suits_grid

@@ -1,5 +1,5 @@
-"""The bases in which value functions are fitted: polynomials. (Those on a grid are in
-`grid.py`.)"""
+"""The bases in which value functions are fitted: what a basis is, and those of polynomials.
+(The basis on a grid is in `grid.py`.)"""
 
 import abc
 import functools as ft
@@ -17,34 +17,35 @@ from ..._products import dot, tensordot
 from .polynomials import hermite, least_squares, num_polynomials
 
 
-# The pilot's paths for each polynomial, and the fewest. The fit hardly depends on them: for
-# the Hénon-Heiles system, by degree 6, 5 to 90 for each polynomial left standard errors of
-# 0.6e-7 to 1.8e-7, for 1e-3 without a fit.
+# The number of pilot paths for each polynomial, and the least number in all. The fit hardly
+# depends on them: for the Hénon-Heiles system by degree 6, standard errors were 0.6e-7 to
+# 1.8e-7 with 5 to 90 paths for each polynomial, and 1e-3 without a fit.
 _PILOTS_PER_POLYNOMIAL = 30
 _FEWEST_PILOTS = 256
-# The pilot's states are perturbed by this fraction of their standard deviations: after the
-# first steps the paths are in only a few different states. Four times as much made the
-# standard errors of that system, and of a pendulum by degree 4, 2 to 5 times larger.
+# The pilot's states are perturbed by this fraction of their standard deviations, since
+# after the first steps the paths are in only a few different states. Four times as much
+# made the standard errors 2 to 5 times larger, for the Hénon-Heiles system and for a
+# pendulum by degree 4.
 _PERTURBATION = 0.2
-# Lower bound of the standard deviations along the axes of the covariance, as a fraction of
-# the largest. Along shorter axes the points do not determine a fit. For both systems 0.001
-# to 0.3 left the same standard errors.
+# A lower bound of the standard deviations along the axes of the covariance, as a fraction
+# of the largest. Along shorter axes the points do not determine a fit. For both systems,
+# 0.001 to 0.3 gave the same standard errors.
 _LEAST_DEVIATION = 0.1
-# The most and the fewest states of the pilot over which derivatives are averaged. In `d`
-# dimensions there are `2**13 / d` of them between these bounds, since a Hessian needs `d`
-# gradients.
+# The most and the fewest pilot paths of `Quadratic`, which averages Hessians over their
+# states. A Hessian in `d` dimensions needs `d` gradients, so between these bounds there are
+# `_QUADRATIC_GRADIENTS / d` paths.
 _MOST_QUADRATIC_PILOTS = 128
 _FEWEST_QUADRATIC_PILOTS = 16
 _QUADRATIC_GRADIENTS = 2**13
 
-# Maps a state to the values that functions are fitted to, or a state and a random key to
-# estimates of them.
+# Maps a state to the values to which functions are fitted, or a state and a random key to
+# estimates of these values.
 Target: TypeAlias = Callable[..., Float[Array, "S m"]]
 
 
 class CovarianceFrame(eqx.Module):
     """Coordinates in which the states have mean zero and standard deviations of about one.
-    Components of the state that do not move are ignored."""
+    They do not depend on components of the state that do not move."""
 
     mean: Float[Array, " d"]
     # The matrices from states to coordinates and back.
@@ -63,8 +64,9 @@ class CovarianceFrame(eqx.Module):
     def of(
         points: Float[Array, "n d"], good: Bool[Array, " n"], scales: Float[Array, " d"]
     ) -> "CovarianceFrame":
-        """The frame along the axes of the covariance of the good points. Divided by
-        `scales`, components are comparable; it is zero for components that do not move."""
+        """The frame along the axes of the covariance of the good points. Components of the
+        state are made comparable by division by their `scales`, which are zero for
+        components that do not move."""
         weights = equal_weights(good, points.dtype)
         mean = weights @ points
         inverse_scales = inverse_or_zero(scales)
@@ -84,8 +86,8 @@ class CovarianceFrame(eqx.Module):
 
     def perturbed(self, states: Float[Array, "n d"]) -> Float[Array, "n d"]:
         """The states, perturbed at random."""
-        # The perturbations are the same in all steps, since drawing from keys would take
-        # long to compile.
+        # All steps have the same perturbations, constants from NumPy: drawing from keys
+        # would take long to compile.
         z = np.random.default_rng(0).normal(0, _PERTURBATION, states.shape)
         return states + dot(jnp.asarray(z, states.dtype), self.to_states.T)
 
@@ -103,12 +105,12 @@ def inverse_or_zero(scales: Float[Array, " d"]) -> Float[Array, " d"]:
 
 
 class AbstractBasis(eqx.Module):
-    """Functions of `d` coordinates. A function is a linear combination with `size`
-    coefficients. The trailing axes of the coefficients are times at which to average, and
-    components of `phi`."""
+    """Functions of `d` coordinates. Each function is a linear combination of `size` basis
+    functions. Arrays of coefficients have the leading axis `size`, followed by axes for
+    times at which to average and for components of `phi`."""
 
     d: eqx.AbstractVar[int]
-    # Such as a degree, and what it is, for messages.
+    # A number that says how fine the basis is, such as a degree, and its name for messages.
     resolution: eqx.AbstractVar[int]
     resolution_name: eqx.AbstractClassVar[str]
 
@@ -134,8 +136,10 @@ class AbstractBasis(eqx.Module):
         good: Bool[Array, " n"],
         scales: Float[Array, " d"],
     ) -> PyTree:
-        """The coordinates, from the pilot's states, its good paths, and a length scale for
-        each component, which is zero for components that do not move."""
+        """The coordinates in which functions are fitted, as a PyTree of arrays. `states`
+        are those of the pilot's paths after a step, and `good` says which paths did not
+        fail. `scales` has a length scale for each component of the state, which is zero if
+        the component does not move."""
 
     @abc.abstractmethod
     def coefficients(
@@ -146,20 +150,21 @@ class AbstractBasis(eqx.Module):
         good: Bool[Array, " n"],
         keys: Key[Array, " n"],
     ) -> Float[Array, "size S m"]:
-        """The coefficients of the functions fitted to `target`, at or near the pilot's
-        `states`, of which the `good` ones did not fail. A basis calls `target(state)`, or
-        `target(state, key)` with the key of the pilot's path for a random estimate, which
-        costs less. (`S` times and `m` numbers of `phi`.)"""
+        """The coefficients of the functions fitted to `target`, for `S` times and `m`
+        components of `phi`. The fit is made at or near the pilot's `states` that are
+        `good`. A basis calls `target(state)`, or for a random estimate, which costs less,
+        `target(state, key)` with the key of the pilot's path."""
 
     @abc.abstractmethod
     def value_at(
         self, frame: Any, y: Float[Array, " d"], c: Float[Array, "size S m"]
     ) -> Float[Array, "S m"]:
-        """The function with these coefficients at a state."""
+        """The values at a state of the functions with these coefficients."""
 
 
 class Hermite(AbstractBasis):
-    """Products of Hermite polynomials up to a total degree, the `resolution`."""
+    """Products of Hermite polynomials in all coordinates, up to a total degree, which is
+    the `resolution`. The coefficients are a least-squares fit."""
 
     d: int
     resolution: int
@@ -194,14 +199,14 @@ class Hermite(AbstractBasis):
         good: Bool[Array, " n"],
         degrees: Sequence[int],
     ) -> Float[Array, "size degrees S m"]:
-        """The least-squares fits of each of these degrees to the values at the good
-        points."""
+        """The coefficients of a least-squares fit of each of these degrees to the values at
+        the good points."""
         B = self.polynomials(frame, points)
         # (n, S * m)
         flat_values = values.reshape(len(values), -1)
-        # Rows of zeros have no part in a fit.
         is_finite = jnp.isfinite(flat_values).all(axis=1)
         is_used = good & jnp.isfinite(B).all(axis=1) & is_finite
+        # Rows of zeros have no part in a fit.
         B = jnp.where(is_used[:, None], B, 0)
         flat_values = jnp.where(is_used[:, None], flat_values, 0)
         sizes = [num_polynomials(self.d, degree) for degree in degrees]
@@ -216,17 +221,20 @@ class Hermite(AbstractBasis):
         return jnp.stack(of_all_points(frame.coordinates(points)), axis=1)
 
     def value_at(self, frame, y, c):
-        # As a sum of products this compiles to one loop without temporary arrays.
         polynomials = hermite(frame.coordinates(y), self.resolution)
+        # A sum of products, rather than a product of arrays, compiles to one loop without
+        # temporary arrays.
         return ft.reduce(jnp.add, map(jnp.multiply, polynomials, c))
 
 
 class Quadratic(AbstractBasis):
-    """Linear functions, or for a `resolution` of 2 quadratic functions. The coefficients
+    """Quadratic functions for a `resolution` of 2, and linear ones for 1. The coefficients
     are the first and then the second derivatives, averaged over the pilot's states. For
-    Gaussian states this is the least-squares fit, by Stein's lemma. Coordinates are states
-    minus their mean, divided by their scales, which are zero for components that do not
-    move."""
+    Gaussian states these averages are the least-squares fit, by Stein's lemma.
+
+    The frame is the mean of the states and the scales of their components. Coordinates are
+    states minus the mean, divided by the scales. For components that do not move, scales
+    and coordinates are zero."""
 
     d: int
     resolution: int
@@ -253,7 +261,8 @@ class Quadratic(AbstractBasis):
         _, scales = frame
 
         def derivatives(key_and_state):
-            """The first and second derivatives at a state, by its coordinates."""
+            """The first and second derivatives of the target at a state, with respect to
+            coordinates `z`, as one array."""
             key, y = key_and_state
 
             def target_from_state(z):
@@ -263,7 +272,8 @@ class Quadratic(AbstractBasis):
                 gradient = jax.jacrev(target_from_state)(z)
                 return gradient, gradient
 
-            # The gradient comes along with its derivative, without another evaluation.
+            # The gradient comes along with its derivative, as auxiliary output, and is not
+            # evaluated once more.
             hessian_and_gradient = jax.jacfwd(gradient_twice, has_aux=True)
             # (S, m, d, d) and (S, m, d)
             hessian, gradient = hessian_and_gradient(jnp.zeros_like(y))
@@ -271,11 +281,11 @@ class Quadratic(AbstractBasis):
             # (d + d**2, S, m)
             return jnp.moveaxis(jnp.concatenate([gradient, flat_hessian], -1), -1, 0)
 
-        # One path after another, since a Hessian needs the memory of `d` gradients.
+        # One path after another, since a Hessian takes the memory of `d` gradients.
         of_paths = lax.map(derivatives, (keys, states))
         weights = equal_weights(good, of_paths.dtype)
         mean = tensordot(weights, jnp.where(jnp.isfinite(of_paths), of_paths, 0), 1)
-        # Linear functions have no second derivatives.
+        # Derivatives of a higher order than the `resolution` are left out.
         order = np.repeat([1, 2], [self.d, self.d**2])[:, None, None]
         return jnp.where(order <= self.resolution, mean, 0)
 
@@ -285,6 +295,6 @@ class Quadratic(AbstractBasis):
         d = len(y)
         gradient = c[:d]
         hessian = c[d:].reshape(d, d, *c.shape[1:])
-        # The Taylor polynomial without its constant, which has no part in a control
-        # variate.
+        # The Taylor polynomial without its constant: a control variate is a difference of
+        # values, from which the constant cancels.
         return tensordot(z, gradient + tensordot(z, hessian, 1) / 2, 1)

@@ -1,4 +1,5 @@
-"""Target functions, fitted backwards in time at the states of a pilot run."""
+"""Value functions, fitted backward in time at the states of a pilot run: a simulation of
+some paths, whose states show where the functions are needed."""
 
 import dataclasses
 import functools as ft
@@ -22,22 +23,22 @@ from .bases import AbstractBasis, equal_weights, Target
 from .noise import cuts_of, Noise
 
 
-# The number of states over which second derivatives along the noise are averaged. A rough
-# mean will do: with any number in place of it, the control variate has mean zero.
+# The number of states over which second derivatives along the noise are averaged. Few are
+# enough: whatever the second derivatives are, the control variate has mean zero.
 _STATES_FOR_SECOND = 32
 
 
 class FittedFunctions(eqx.Module):
-    """The value functions of a level, one after each step, for each time at which to
-    average (`S`) and each component of `phi` (`m`). For several levels there is another
-    leading axis.
+    """The value functions of a level: after each step one function for each time at which
+    to average (`S`) and each component of `phi` (`m`). For several levels all arrays have
+    another leading axis.
 
-    - `frames`: the coordinates of the basis, with a leading axis of steps.
-    - `coefficients`: the coefficients of the `size` functions of the basis, with axes for
-        steps, `size`, `S` and `m`.
-    - `second_derivatives`: those along the noise, from `Noise.mean_second_derivatives`,
-        with axes for steps, twice the random variables, `S` and `m`; `None` if there are
-        few outcomes.
+    - `frames`: the coordinates of the basis after each step, with a leading axis of steps.
+    - `coefficients`: the coefficients of the `size` functions of the basis, of shape
+        `(steps, size, S, m)`.
+    - `second_derivatives`: the mean second derivatives along the random variables of each
+        step, from `Noise.mean_second_derivatives`, of shape `(steps, n, n, S, m)`; `None`
+        if a step has few outcomes.
     """
 
     frames: PyTree[Array]
@@ -46,15 +47,15 @@ class FittedFunctions(eqx.Module):
     basis: AbstractBasis = eqx.field(static=True)
 
     def __call__(self, i: Any, y: Y) -> Float[Array, "S m"]:
-        """Their values at a state after step `i`."""
+        """The values of the functions after step `i` at a state."""
         frame = jtu.tree_map(lambda x: x[i], self.frames)
         return self.basis.value_at(frame, ravel(y), self.coefficients[i])
 
 
 def room_for_steps(problem: Problem) -> int:
-    """The number of steps for which the arrays of a fit have room, on any level: their
-    shapes must be known when compiling."""
-    # With two levels a trial halves all steps.
+    """The number of steps for which the arrays of a fit have room on each level. (The
+    number of steps itself is traced, but shapes must be known when compiling.)"""
+    # With two levels a trial may fit functions once more, with all steps halved.
     most = problem.finest_steps * (2 if len(problem.levels.h) == 2 else 1)
     # Powers of two, so that most other numbers of steps compile nothing anew.
     return 1 << (most - 1).bit_length()
@@ -69,55 +70,43 @@ def fit(
     basis: AbstractBasis,
     most_steps: int,
 ) -> tuple[FittedFunctions, Int[Array, ""]]:
-    """The functions of the level with this index, with a leading axis of levels, by a pilot
-    run forward in time and fits backward; and how many of the pilot's paths failed. All
-    levels have arrays for `most_steps` steps, so that they share a program."""
+    """Fits the value functions of the level with this index. Returns the functions, with a
+    leading axis of one level, and the number of the pilot's paths that failed. All levels
+    share a program, since each has arrays for `most_steps` steps."""
     noise = Noise.of(problem, problem.level(index))
     num_steps = noise.level.num_steps
     keys = jr.split(jr.fold_in(key, index), basis.num_pilots)
-    starts, states, good = _run_pilot(noise, keys, most_steps)
-
-    # How far each component moves: the root of the mean squared distance from the start
-    # over all steps of good paths. It is zero for components that do not move.
-    start = ravel(problem.y0)
-    if problem.y0_of is not None:
-        start = jnp.mean(starts, axis=0)
-    # (steps, paths, d)
-    distances = jnp.where(good[:, None], jnp.abs(states - start), 0)
-    # Dividing by the largest value first avoids underflow of squares in single precision.
-    largest = jnp.max(distances, axis=(0, 1))
-    scaled = distances / jnp.where(largest > 0, largest, 1)
-    weights = equal_weights(good, start.dtype)
-    mean_square = jnp.einsum("n,ind->d", weights, scaled**2) / num_steps
-    scales = largest * jnp.sqrt(mean_square)
+    starts, states_after, good = _run_pilot(noise, keys, most_steps)
+    scales = _length_scales(noise, starts, states_after, good)
 
     def frame_after(i: Any) -> PyTree[Array]:
-        return basis.frame(states[i], good, scales)
+        return basis.frame(states_after[i], good, scales)
 
     def fit_step(num_fitted: Any, fitted: FittedFunctions) -> FittedFunctions:
-        # The functions after later steps come first: those after a step are fitted to them.
+        """Fits the functions after step `i`, counted from the last step backward."""
         i = num_steps - 1 - num_fitted
         frame = frame_after(i)
         target = _target(noise, fitted, i)
-        coefficients = basis.coefficients(target, frame, states[i], good, keys)
-        put_step = lambda of_steps, of_step: of_steps.at[i].set(of_step)
-        return dataclasses.replace(
-            fitted,
-            frames=jtu.tree_map(put_step, fitted.frames, frame),
-            coefficients=put_step(fitted.coefficients, coefficients),
+        # All steps share the keys of the pilot's paths. Their draws are independent, since
+        # the target also takes the number of the step to draw.
+        coefficients = basis.coefficients(target, frame, states_after[i], good, keys)
+        fitted_after_i = FittedFunctions(frame, coefficients, None, basis)
+        return jtu.tree_map(
+            lambda all_steps, this: all_steps.at[i].set(this), fitted, fitted_after_i
         )
 
-    struct_of_coefficients = jax.ShapeDtypeStruct(
-        (basis.size, *problem.output_shape), problem.dtype
+    no_frames = jtu.tree_map(
+        lambda x: jnp.zeros((most_steps, *x.shape), x.dtype),
+        jax.eval_shape(frame_after, 0),
     )
-    frames, coefficients = jtu.tree_map(
-        lambda of_step: jnp.zeros((most_steps, *of_step.shape), of_step.dtype),
-        (jax.eval_shape(frame_after, 0), struct_of_coefficients),
+    no_coefficients = jnp.zeros(
+        (most_steps, basis.size, *problem.output_shape), problem.dtype
     )
-    unfitted = FittedFunctions(frames, coefficients, None, basis)
+    unfitted = FittedFunctions(no_frames, no_coefficients, None, basis)
     fitted = lax.fori_loop(0, num_steps, fit_step, unfitted)
 
-    # No fit reads second derivatives, so they are computed once, at the end.
+    # The states before a step are those after the step before: (steps, paths, d).
+    states_before = jnp.concatenate([starts[None], states_after[:-1]])
     _, unravel = jfu.ravel_pytree(problem.y0)
 
     def second_derivatives_of_step(step_and_states):
@@ -125,42 +114,69 @@ def fit(
         ys = jax.vmap(unravel)(states)
         return noise.mean_second_derivatives(i, ys, ft.partial(fitted, i))
 
-    # The states before each step are those after the step before: (steps, paths, d).
-    states_before = jnp.concatenate([starts[None], states[:-1]])
-    few_states = states_before[:, :_STATES_FOR_SECOND]
+    # No fit reads second derivatives, so they are computed once, at the end.
     second_derivatives = lax.map(
-        second_derivatives_of_step, (jnp.arange(most_steps), few_states)
+        second_derivatives_of_step,
+        (jnp.arange(most_steps), states_before[:, :_STATES_FOR_SECOND]),
     )
     functions = dataclasses.replace(fitted, second_derivatives=second_derivatives)
     return jtu.tree_map(lambda x: x[None], functions), jnp.sum(~good)
 
 
+def _length_scales(
+    noise: Noise,
+    starts: Float[Array, "paths d"],
+    states_after: Float[Array, "steps paths d"],
+    good: Bool[Array, " paths"],
+) -> Float[Array, " d"]:
+    """How far each component of the state moves: the root of the mean squared distance from
+    the start, over all steps of the good paths of the pilot run. It is zero for components
+    that do not move."""
+    start = ravel(noise.problem.y0)
+    if noise.problem.y0_of is not None:
+        start = jnp.mean(starts, axis=0)
+    # (steps, paths, d)
+    distances = jnp.where(good[:, None], jnp.abs(states_after - start), 0)
+    # Dividing by the largest value first avoids underflow of squares in single precision.
+    largest = jnp.max(distances, axis=(0, 1))
+    scaled = distances / jnp.where(largest > 0, largest, 1)
+    weights = equal_weights(good, start.dtype)
+    sum_over_steps = jnp.einsum("n,ind->d", weights, scaled**2)
+    return largest * jnp.sqrt(sum_over_steps / noise.level.num_steps)
+
+
 def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
-    """What the functions after step `i` are fitted to, as a function of a flat state and
-    maybe a random key. For averages at the end of this step that is `phi` itself; for later
-    times the mean, over the outcomes of the next step, of the functions after that one,
-    which are already fitted; and for earlier times zero. If a step has many outcomes, a key
-    serves to estimate the mean from a draw."""
+    """The function of a flat state to which the functions after step `i` are fitted. Its
+    value depends on the time at which to average:
+
+    - At the end of step `i` it is `phi` itself.
+    - At a later time it is the mean, over the outcomes of the next step, of the functions
+        after the next step, which are already fitted.
+    - At an earlier time it is zero.
+
+    If a step has many outcomes, the target may also be called with a random key, and then
+    estimates the mean from a draw."""
     problem = noise.problem
     level = noise.level
     _, unravel = jfu.ravel_pytree(problem.y0)
-    # There is no step after the last one. The mean is then computed over the last step
-    # itself, and not used: no time at which to average is later.
+    # There is no step after the last one. The mean is then taken over the last step once
+    # more, and not used: no time at which to average is later.
     next_step = jnp.minimum(i + 1, level.num_steps - 1)
 
     def value(flat_y: Float[Array, " d"], key: PRNGKeyArray | None = None) -> Array:
         y = unravel(flat_y)
         variables = None
         if key is not None:
-            # Draws by one key are numbered. The pilot's own steps have the numbers of the
-            # steps for which there is room.
-            number = len(fitted.coefficients) + i
+            # The pilot draws its steps by the same keys, with smaller numbers: those of the
+            # steps for which the arrays have room.
+            draw_index = len(fitted.coefficients) + i
             cuts = cuts_of([law.probabilities for law in noise.laws])
-            variables, _ = noise.draw(key, number, cuts)
-        # (S, m), and `phi` (m).
+            variables, _ = noise.draw(key, draw_index, cuts)
+        # (S, m)
         mean = noise.mean(next_step, y, ft.partial(fitted, next_step), variables)
+        # (m)
         phi = problem.values(problem.t0 + (i + 1) * level.h, y).astype(mean.dtype)
-        # Which of the times at which to average are the end of this step, or later.
+        # For each time at which to average.
         is_end_of_step = level.saved_steps == i + 1
         is_later = level.saved_steps > i + 1
         mean_or_zero = jnp.where(is_later[:, None], mean, 0)
@@ -174,16 +190,15 @@ def _run_pilot(
 ) -> tuple[
     Float[Array, "paths d"], Float[Array, "steps paths d"], Bool[Array, " paths"]
 ]:
-    """Simulates a path for each key, at whose states functions are fitted. The states at
-    the start and after each step, and which of the paths did not fail."""
+    """Simulates a path for each key. Returns the states at the start, the states after each
+    step, and which paths did not fail."""
     problem = noise.problem
     # With equal probabilities of all outcomes the pilot's paths spread further than others,
     # so that the fit also holds for outliers.
-    equal_cuts = cuts_of(
-        [np.full(len(x.values), 1 / len(x.values)) for x in noise.laws]
-    )
+    num_values = [len(law.values) for law in noise.laws]
+    equal_cuts = cuts_of([np.full(count, 1 / count) for count in num_values])
 
-    def step_one(i, y, args, key):
+    def step_of_path(i, y, args, key):
         x, _ = noise.draw(key, i, equal_cuts)
         noise_of_path = noise.with_args(args)
         # Solvers start anew in each step, which is good enough for a fit.
@@ -191,9 +206,9 @@ def _run_pilot(
         y, _, success = noise_of_path.step(i, y, solver_state, x)
         return y, success
 
-    def step_all(i: Any, carry: tuple[PathStates, Array]) -> tuple[PathStates, Array]:
+    def step(i: Any, carry: tuple[PathStates, Array]) -> tuple[PathStates, Array]:
         paths, states = carry
-        y, success = jax.vmap(ft.partial(step_one, i))(paths.y, paths.args, keys)
+        y, success = jax.vmap(ft.partial(step_of_path, i))(paths.y, paths.args, keys)
         paths = paths.after_step(problem, y, None, success)
         return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
 
@@ -203,5 +218,5 @@ def _run_pilot(
     starts = jax.vmap(ravel)(paths.y)
     states = jnp.broadcast_to(starts, (most_steps, *starts.shape))
     num_steps = noise.level.num_steps
-    paths, states = lax.fori_loop(0, num_steps, step_all, (paths, states))
+    paths, states = lax.fori_loop(0, num_steps, step, (paths, states))
     return starts, states, ~paths.failed

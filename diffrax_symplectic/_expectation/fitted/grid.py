@@ -1,4 +1,5 @@
-"""Value functions of one or two coordinates on a grid."""
+"""The basis of value functions of one or two coordinates: a polynomial, and a correction on
+a grid of points."""
 
 import functools as ft
 import math
@@ -16,40 +17,42 @@ from .bases import AbstractBasis, CovarianceFrame, Hermite
 
 
 # The half-width of a grid, in distances from the median to the furthest pilot path. For the
-# mean of q^2 of a pendulum, the standard error was 1.3e-10 (1.7e-2 without a fit); 2e-6
-# with a width of 1.05, where paths leave the grid, and 3e-9 with one of 2.5, where its
-# points are far apart.
+# mean of q^2 of a pendulum, the standard error was 1.3e-10, where it was 1.7e-2 without a
+# fit. With a half-width of 1.05, which paths leave, it was 2e-6, and with one of 2.5, which
+# sets the points far apart, 3e-9.
 _WIDTH_PER_RANGE = 1.5
-# The coordinate, from 0 in the middle to 1 at the edge, at which the correction starts to
-# fall to zero. (With 0.6 the standard error of the pendulum was 2e-7.)
+# The correction falls to zero from this coordinate to the edge of the grid, where the
+# coordinate is 1. (With 0.6 the standard error of the pendulum was 2e-7.)
 _START_OF_FALL = 0.9
-# Points between this coordinate and the start of the fall are near the edge: there the
-# polynomials are compared.
+# The grid points at which polynomials of different degrees are compared have coordinates
+# between this one and the start of the fall.
 _START_NEAR_EDGE = 0.8 * _START_OF_FALL
-# The interpolation points along each axis: polynomials of degree 5. With 4 points the
-# standard error of the pendulum was 4e-8, with 8 it was 7e-12 to 5e-10.
+# The number of interpolation points along each axis, for polynomials of degree 5. With 4
+# points the standard error of the pendulum was 4e-8, with 8 it was 7e-12 to 5e-10.
 _STENCIL = 6
-# With 1,024 pilot paths for a grid of 32 points, means were off by 15 standard errors:
-# paths of probability 1e-6 left the grid. This many suffice, at no loss of speed.
+# The number of pilot paths. With 1,024 for a grid of 32 points, means were off by 15
+# standard errors, since paths of probability 1e-6 left the grid. This many suffice, at no
+# loss of speed.
 _PILOTS = 2**13
-# A grid corrects the best polynomial of these degrees.
+# The grid corrects the best of the polynomials of these degrees.
 _DEGREES = (0, 2, 4)
 # In the middle the spacing is that of a uniform grid whose half-width is this many
-# interquartile ranges: for normal states, whose range is 1.35 standard deviations, 9.4
-# standard deviations.
+# interquartile ranges. For normal states, whose interquartile range is 1.35 standard
+# deviations, these are 9.4 standard deviations.
 _RANGES_OF_UNIFORM_GRID = 7
-# The grid is at most this many times as wide as that uniform one, since the interquartile
-# range may be zero. And it is always stretched a little, with at least this squared `bend`,
-# since coordinates are divided by a number that is zero without stretching.
+# The grid is at most this many times as wide as the uniform one, since the interquartile
+# range may be zero.
 _MOST_STRETCH = 1e4
+# The least square of `bend` in `Grid.frame`. Without bending, coordinates would be divided
+# by zero.
 _LEAST_SQUARED_BEND = 0.01
 
 
 class StretchedFrame(eqx.Module):
-    """Coordinates from -1 to 1 on a grid: linear near the middle, and growing with the
-    fourth root further out, where there are few paths.
+    """Coordinates that go from -1 to 1 on a grid. They are linear near the middle, and grow
+    with the fourth root further out, where there are few paths.
 
-    For the coordinate `z` of `inner` it is
+    From the coordinate `z` of `inner`, the coordinate is
     `_compressed(_compressed(factor * (z - median))) / edge`.
     """
 
@@ -80,11 +83,23 @@ def _expanded(x: Array) -> Array:
     return x * jnp.sqrt(x**2 / 2 + jnp.sqrt(1 + x**4 / 4))
 
 
+def _falling_factors(x: Float[np.ndarray, "nodes d"]) -> Float[np.ndarray, " nodes"]:
+    """The factors of the correction at grid points: one in the middle, and zero at the edge
+    of the grid. Where they fall along an axis, their first two derivatives vanish at both
+    ends."""
+    fall = np.clip((np.abs(x) - _START_OF_FALL) / (1 - _START_OF_FALL), 0, 1)
+    return np.prod(1 - fall**3 * (10 - 15 * fall + 6 * fall**2), axis=1)
+
+
 class Grid(AbstractBasis):
-    """A polynomial plus a correction on a grid, interpolated by polynomials of degree 5
-    through the 6 nearest points along each axis. The `resolution` is the number of points
-    along an axis. The correction falls to zero towards the edge of the grid; beyond it only
-    the polynomial remains, whose degree is the one that fits best near the edge."""
+    """A polynomial plus a correction on a grid. The correction is interpolated by
+    polynomials of degree 5 through the 6 nearest points along each axis. It falls to zero
+    towards the edge of the grid, beyond which only the polynomial remains. The polynomial
+    has the degree that fits best near the edge. The `resolution` is the number of grid
+    points along an axis.
+
+    The coefficients are those of the polynomial, and then the correction at all grid
+    points."""
 
     d: int
     resolution: int
@@ -112,7 +127,7 @@ class Grid(AbstractBasis):
         z = inner.coordinates(states)
         least = jnp.min(jnp.where(good[:, None], z, jnp.inf), axis=0)
         most = jnp.max(jnp.where(good[:, None], z, -jnp.inf), axis=0)
-        # A few paths suffice for the quartiles. NaNs are left out.
+        # A few paths suffice for the quartiles, which leave out NaNs.
         few_paths = jnp.where(good[:, None], z, jnp.nan)[: self._base.num_pilots]
         probabilities = jnp.array([0.25, 0.5, 0.75])
         quartiles = jnp.nanquantile(few_paths, probabilities, axis=0)
@@ -125,11 +140,13 @@ class Grid(AbstractBasis):
             half_width / _MOST_STRETCH,
             half_width,
         )
-        # In the middle, where `_compressed` has slope 1, the coordinate has the slope
-        # `factor / edge`, which is `1 / uniform_half_width`. At the edge the argument of
-        # `_compressed(_compressed(...))` is `bend = factor * half_width`. So `stretch` is
-        # `bend / _compressed(_compressed(bend))`: one at zero, and for large `bend` about
-        # `bend ** (3 / 4)`. It is replaced by `(1 + bend**2) ** (3 / 8)`, and solved.
+        # The coordinate is `c(factor * (z - median)) / edge`, with the function `c` that
+        # applies `_compressed` twice. At the edge its argument is `bend = factor *
+        # half_width`, so that `edge = c(bend)`. In the middle, where `c` has slope 1, the
+        # coordinate has the slope `factor / edge`, which must be `1 / uniform_half_width`.
+        # Together this is `bend / c(bend) = stretch`. The left side is one for `bend = 0`,
+        # and about `bend ** (3 / 4)` for large `bend`. For a closed solution it is replaced
+        # by `(1 + bend**2) ** (3 / 8)`, which has both properties.
         stretch = half_width / uniform_half_width
         bend = jnp.sqrt(jnp.maximum(stretch ** (8 / 3) - 1, _LEAST_SQUARED_BEND))
         return StretchedFrame(
@@ -143,7 +160,7 @@ class Grid(AbstractBasis):
         base = self._base
         num_pilots = base.num_pilots
         axes = [np.linspace(-1, 1, self.resolution)] * self.d
-        # The coordinates of the grid points: (nodes, d).
+        # The coordinates of the nodes, which are the grid points: (nodes, d).
         x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, self.d)
         nodes = frame.states(jnp.asarray(x, states.dtype))
         pilots = frame.inner.perturbed(states[:num_pilots])
@@ -156,20 +173,17 @@ class Grid(AbstractBasis):
         polynomials = base.polynomials(frame.inner, nodes)
         # (nodes, degrees, S, m)
         residual = values[num_pilots:, None] - tensordot(polynomials, c, 1)
-        # The target may overflow where it grows fast.
+        # A target that grows fast may overflow.
         residual = jnp.where(jnp.isfinite(residual), residual, 0)
-        # The degree that leaves the least near the edge, for each time and component.
+        # For each time and component, the polynomial with the smallest residual near the
+        # edge is the best.
         distance = np.max(np.abs(x), axis=1)
         is_near_edge = (distance > _START_NEAR_EDGE) & (distance < _START_OF_FALL)
         largest_residual = jnp.max(jnp.abs(residual[is_near_edge]), axis=0)
-        best_degree = jnp.argmin(largest_residual, axis=0)[None, None]
-        c_of_best = jnp.take_along_axis(c, best_degree, 1)[:, 0]
-        residual_of_best = jnp.take_along_axis(residual, best_degree, 1)[:, 0]
-        # The correction falls from the whole residual in the middle of the grid to zero at
-        # its edge. Along each axis, the fall has two vanishing derivatives at both ends.
-        fall = np.clip((np.abs(x) - _START_OF_FALL) / (1 - _START_OF_FALL), 0, 1)
-        factors = np.prod(1 - fall**3 * (10 - 15 * fall + 6 * fall**2), axis=1)
-        factors = jnp.asarray(factors, residual.dtype)
+        best = jnp.argmin(largest_residual, axis=0)[None, None]
+        c_of_best = jnp.take_along_axis(c, best, 1)[:, 0]
+        residual_of_best = jnp.take_along_axis(residual, best, 1)[:, 0]
+        factors = jnp.asarray(_falling_factors(x), residual.dtype)
         correction = residual_of_best * factors[:, None, None]
         return jnp.concatenate([c_of_best, correction])
 
@@ -181,7 +195,8 @@ class Grid(AbstractBasis):
     def interpolate(
         self, x: Float[Array, " d"], c: Float[Array, "nodes ..."]
     ) -> Float[Array, "..."]:
-        """The values on the grid, interpolated at a point, and zero beyond the grid."""
+        """Interpolates the values `c` on the grid at the point `x`. Beyond the grid the
+        result is zero."""
         # The number of grid points along each axis.
         n = self.resolution
         value_shape = c.shape[1:]
@@ -191,7 +206,7 @@ class Grid(AbstractBasis):
         position = (x + 1) * (n - 1) / 2
         # Whether `half` grid points lie on each side, along each axis.
         is_inside = jnp.all((position >= half - 1) & (position <= n - half))
-        # Outside, the result at some point inside is computed, and dropped.
+        # For a point outside, the value at some point inside is computed, and dropped.
         safe_position = jnp.where(is_inside, position, n / 2)
         # The first interpolation point along each axis.
         begin = jnp.minimum(jnp.floor(safe_position) - (half - 1), n - _STENCIL)
@@ -199,14 +214,15 @@ class Grid(AbstractBasis):
         values_on_grid = c.reshape(*[n] * self.d, *value_shape)
         block_shape = *[_STENCIL] * self.d, *value_shape
         block = lax.dynamic_slice(values_on_grid, start_indices, block_shape)
-        # The Lagrange polynomials of the interpolation points.
+        # The Lagrange polynomials of the interpolation points, at the point.
         distances = [safe_position - begin - j for j in range(_STENCIL)]
         weights = []
         for j in range(_STENCIL):
             others = [k for k in range(_STENCIL) if k != j]
             product = ft.reduce(jnp.multiply, [distances[k] for k in others])
             weights.append(product / math.prod(j - k for k in others))
-        # Each pass sums over the leading axis, which is the next axis of the grid.
+        # Each pass sums over the leading axis of the block, and so removes it. What is then
+        # the leading axis is the next axis of the grid.
         for axis in range(self.d):
             products = [weight[axis] * row for weight, row in zip(weights, block)]
             block = ft.reduce(jnp.add, products)

@@ -1,10 +1,10 @@
 """The laws by which paths with a control variate draw their noise.
 
-A fit is worst where paths seldom come, and the few that do may carry most of the variance,
-or much of the mean. So half of the paths draw wider noise, by which such paths are common,
-and each path counts by its likelihood ratio: the probability of its noise by its own law,
-divided by its probability by the mixture of laws ([Hesterberg
-(1995)](https://doi.org/10.1080/00401706.1995.10484303)).
+A fit is worst where paths seldom come, and the few paths that come there may carry most of
+the variance, or much of the mean. So half of the paths draw their noise by other laws, by
+which such paths are common. Each path is weighted by its likelihood ratio: the probability
+of its noise by the own law of the noise, divided by the probability by the mixture of all
+laws ([Hesterberg (1995)](https://doi.org/10.1080/00401706.1995.10484303)).
 """
 
 import collections
@@ -24,35 +24,34 @@ from ..._terms import number_of_noises
 from .noise import cuts_of, Noise, padded
 
 
-# The share of the paths that draw by other laws. Weights are then at most
+# The share of the paths that draw by other laws than the own one. Weights are then at most
 # 1 / (1 - share). For the mean of exp(q) of three oscillators, errors in units of the error
-# bar were 0.98 to 1.10 in the root mean square; with a share of a quarter 1.14 to 1.17,
-# since the few paths in the tails told less of the variance there.
+# bar were 0.98 to 1.10 in the root mean square. With a share of a quarter they were 1.14 to
+# 1.17, since the few paths in the tails told less of the variance there.
 _SHARE_OF_OTHERS = 1 / 2
-# The relative entropy of the changed noise of a whole path with respect to its own law, in
-# nats. Typical paths of the changed noise are then e^4 = 55 times less likely by their own
-# law. (With 8 nats the standard errors were 1.1 times larger.)
+# The relative entropy of another law of the noise of a whole path with respect to the own
+# law, in nats. Typical paths by the other law are then e^4 = 55 times less likely by the
+# own law. (With 8 nats the standard errors were 1.1 times larger.)
 _NATS = 4.0
-# The largest tilt. It multiplies the probability of the largest of three outcomes, sqrt(3)
-# standard deviations, by e^(4 sqrt(3)) = 1,000 relative to that of the middle one, zero:
-# nearly all outcomes are then the largest.
+# The largest tilt of a law. Of three outcomes, the largest is sqrt(3) standard deviations,
+# and the middle one zero. This tilt multiplies the probability of the largest, relative to
+# that of the middle one, by e^(4 sqrt(3)) = 1,000: nearly all draws are then the largest.
 _MOST_TILT = 4.0
-# The bisection halves its interval this many times, after which only rounding errors in
-# single precision remain.
+# How often the bisection for the strength of a change halves its interval. After that only
+# rounding errors in single precision remain.
 _HALVINGS = 30
-# With at most this many noises there is a law for each way to push each of them to one side
-# or the other. Each further noise would double the number of laws.
+# With at most this many noises there is a law for each choice of a side to which each noise
+# is pushed. Each further noise would double the number of laws.
 _MOST_NOISES_PUSHED = 2
 
 
 class Mixture(eqx.Module):
-    """The laws of the noise of paths, of which the first one is its own.
+    """The laws by which paths draw their noise. Law number 0 is the noise's own.
 
     - `shares`: the probability with which a path draws by each law.
-    - `cuts`: the cuts between the random words that choose outcomes, as for `Noise.draw`,
-        for each level and law.
-    - `log_ratios`: for each level, law and random variable the logarithm of the probability
-        of each outcome by the law, divided by that by the own law.
+    - `cuts`: for each level and law, the `cuts` of the random words for `Noise.draw`.
+    - `log_ratios`: for each level, law, random variable and outcome, the logarithm of the
+        probability of the outcome by the law divided by the probability by the own law.
     """
 
     shares: Float[Array | np.ndarray, " laws"]
@@ -61,44 +60,40 @@ class Mixture(eqx.Module):
 
     @staticmethod
     def of(problem: Problem) -> "Mixture":
-        """The noise's own law, a wider one, and for one noise or two those in which each
-        noise pushes to one side, in the order of `itertools.product`."""
+        """The mixture of the noise's own law, a wider one, and for one noise or two also
+        the laws by which each noise pushes to one side."""
         laws = Noise.of(problem, problem.level(0)).laws
         own = [np.array(law.probabilities) for law in laws]
+        padded_own = padded(own)
         num_noises = number_of_noises(problem.terms)
         all_signs = []
         if num_noises <= _MOST_NOISES_PUSHED:
             all_signs = [*itertools.product((-1, 1), repeat=num_noises)]
-        # The increments come first. The other variables, which are only in products with
-        # them, are not tilted.
+        # The increments of the noises come first. The other variables, which appear only in
+        # products with increments, are not tilted.
         not_tilted = [0] * (len(laws) - num_noises)
 
         cuts = []
         log_ratios = []
         num_steps = problem.levels.num_steps
-        # Each level, which has its own number of steps, has an equal part of the entropy.
-        for most_nats in _NATS / len(num_steps) / num_steps:
-            # With a width of 1 all outcomes are equally probable.
-            width = _strongest_change(laws, _widened, 1.0, most_nats)
-            # By law of the path and variable: the probabilities of outcomes.
+        # All levels have equal parts of the entropy, and so have the steps of a level.
+        for nats_of_step in _NATS / len(num_steps) / num_steps:
+            width = _strongest_change(laws, _widened, 1.0, nats_of_step)
+            largest_tilt = _strongest_change(laws, _tilted, _MOST_TILT, nats_of_step)
+            # For each law of the mixture and each variable, the probabilities of outcomes.
             probabilities = [own, [_widened(law, width) for law in laws]]
-            tilt = _strongest_change(laws, _tilted, _MOST_TILT, most_nats)
             for signs in all_signs:
-                signed_laws = zip([*signs, *not_tilted], laws)
-                probabilities.append([_tilted(law, k * tilt) for k, law in signed_laws])
+                tilts = [largest_tilt * sign for sign in (*signs, *not_tilted)]
+                probabilities.append([*map(_tilted, laws, tilts)])
             cuts.append([cuts_of(of_law) for of_law in probabilities])
             log_ratios.append(
-                [
-                    padded([np.log(p / p_own) for p, p_own in zip(of_law, own)])
-                    for of_law in probabilities
-                ]
+                [np.log(padded(of_law) / padded_own) for of_law in probabilities]
             )
         num_others = 1 + len(all_signs)
-        shares_of_others = np.full(num_others, _SHARE_OF_OTHERS / num_others)
+        shares = np.full(1 + num_others, _SHARE_OF_OTHERS / num_others, problem.dtype)
+        shares[0] = 1 - _SHARE_OF_OTHERS
         return Mixture(
-            shares=np.append(1 - _SHARE_OF_OTHERS, shares_of_others).astype(
-                problem.dtype
-            ),
+            shares=shares,
             cuts=np.array(cuts),
             log_ratios=np.array(log_ratios, problem.dtype),
         )
@@ -111,18 +106,19 @@ class Mixture(eqx.Module):
 
     def draw_law(self, key: PRNGKeyArray) -> Int[Array, ""]:
         """The number of the law by which the path with this key draws, on all levels."""
-        # In place of the numbers of a draw and of a level. No level has this number, so the
-        # noise of steps has other words.
+        # These two numbers take the place of a step and a level. No level has this number,
+        # so the words are independent of those of the noise.
         place = jnp.array(0), jnp.array(len(self.cuts))
         (words,) = random_words(key, place, 1, 1)
         uniform = words.astype(self.shares.dtype) / 2.0**32
-        # Not `>=`, since in single precision the largest words are rounded to one.
+        # Not `>=`: in single precision the largest words are rounded to one, and would
+        # choose the last law even if its share is zero.
         return jnp.sum(uniform > jnp.cumsum(self.shares)[:-1])
 
     def weights(self, log_ratios: Float[Array, "paths laws"]) -> Float[Array, " paths"]:
-        """The likelihood ratios of paths: the probability of their noise by its own law,
-        divided by that by the mixture. `log_ratios` are summed over all variables, steps
-        and levels."""
+        """The likelihood ratios of paths: the probability of the noise of a path by the own
+        law, divided by the probability by the mixture. `log_ratios` are those of the
+        outcomes of all variables, steps and levels, summed."""
         log_shares = jnp.log(jnp.asarray(self.shares))
         return jnp.exp(-jax.nn.logsumexp(log_shares + log_ratios, axis=1))
 
@@ -131,21 +127,22 @@ def log_ratios_of_outcomes(
     log_ratios: Float[Array | np.ndarray, "laws n outcomes"],
     has_outcome: Bool[Array, "n outcomes"],
 ) -> Float[Array, " laws"]:
-    """The logarithms of the probabilities of a step's outcomes by each law, divided by
-    those by the own law."""
+    """For each law, the logarithm of the probability of a step's outcomes by the law
+    divided by the probability by the own law. `log_ratios` are those of a level in a
+    `Mixture`."""
     return jnp.sum(jnp.where(has_outcome, log_ratios, 0), axis=(1, 2))
 
 
 def _widened(law: Discrete, width: float) -> np.ndarray:
-    """The law's probabilities for a `width` of 0, equal ones for 1, and averages of both in
-    between."""
+    """The probabilities of a wider law: the law's own for a `width` of 0, equal ones for a
+    `width` of 1, and weighted averages of both in between."""
     own = np.array(law.probabilities)
     return (1 - width) * own + width / len(own)
 
 
 def _tilted(law: Discrete, tilt: float) -> np.ndarray:
-    """The law's probabilities times the exponential of `tilt` times the outcome,
-    normalized."""
+    """The probabilities of an exponentially tilted law, proportional to those of the law
+    times `exp(tilt * value)`."""
     weights = np.array(law.probabilities) * np.exp(tilt * np.array(law.values))
     return weights / np.sum(weights)
 
@@ -156,10 +153,11 @@ def _strongest_change(
     most: float,
     most_nats: float,
 ) -> float:
-    """The largest strength, up to `most`, for which the probabilities
-    `changed_probabilities(law, strength)` give the variables of a step together a relative
-    entropy of at most `most_nats` with respect to their own laws: the sum of
-    `changed * log(changed / own)` over all outcomes, which grows with the strength."""
+    """The largest strength of a change of laws, up to `most`, for which the variables of a
+    step together have a relative entropy of at most `most_nats` with respect to their own
+    laws. A changed law has the probabilities `changed_probabilities(law, strength)`. The
+    relative entropy is the sum of `changed * log(changed / own)` over all outcomes, which
+    grows with the strength."""
     law_counts = collections.Counter(laws)
     lower = 0.0
     upper = most

@@ -24,33 +24,34 @@ from ..._terms import outcomes
 # each have 81 outcomes, five have 243.
 _MOST_OUTCOMES = 100
 
-# A function of the state.
+# A function of the state of the equation.
 Function: TypeAlias = Callable[[Y], Array]
 
 
-# Values of the random variables of a step, those of all variables along the last axis, and
-# weights by which the expectation of any function of them is a sum over these values.
+# Nodes and weights of an expectation over the random variables of a step. A node has a
+# value for each variable. The expectation of a function of the variables is the weighted
+# sum of its values at all nodes.
 WeightedNodes: TypeAlias = tuple[
     Float[Array | np.ndarray, "K n"], Float[np.ndarray, " K"]
 ]
 
 
 class Noise(eqx.Module):
-    r"""The random variables $x$ of the steps of a level. If there are few outcomes, a step
+    r"""The random variables $x$ of the steps of a level. If a step has few outcomes, a step
     is taken for each of them, and expectations are finite sums.
 
-    Otherwise $u(y_1) - \mathbb E[u(y_1)]$ is replaced by $a \cdot x + \frac12 (x^\top C x -
-    \mathrm{tr}\, C \Sigma)$, with the first and second derivatives $a$ and $C$ of
-    $u(y_1(x))$ at $x = 0$ and the variances $\Sigma$. Its mean is zero for any $a$ and $C$,
-    so one $C$ serves all paths. For a quadratic function and noise that enters the step
-    linearly it is exact.
+    Otherwise the control variate $u(y_1) - \mathbb E[u(y_1)]$ is replaced by $a \cdot x +
+    \frac12 (x^\top C x - \mathrm{tr}\, C \Sigma)$, with the first and second derivatives
+    $a$ and $C$ of $u(y_1(x))$ at $x = 0$, and the variances $\Sigma$ of $x$. The
+    replacement is exact for a quadratic $u$ and noise that enters the step linearly. Its
+    mean is zero for any $a$ and $C$, so one $C$ serves all paths.
     """
 
     problem: Problem
     level: Level
     laws: tuple[Discrete, ...] = eqx.field(static=True)
-    # All outcomes of a step with their probabilities, if there are few outcomes.
-    outcomes: WeightedNodes | None
+    # All outcomes of a step with their probabilities; `None` if there are many outcomes.
+    few_outcomes: WeightedNodes | None
 
     @staticmethod
     def of(problem: Problem, level: Level) -> "Noise":
@@ -66,7 +67,7 @@ class Noise(eqx.Module):
             )
         few_outcomes = None
         if math.prod(len(law.values) for law in discrete_laws) <= _MOST_OUTCOMES:
-            # Only Gaussian variables have nodes, of which there are none here.
+            # `num_nodes` is for Gaussian variables, of which there are none here.
             values, probabilities = outcomes(discrete_laws, num_nodes=1)
             few_outcomes = values.astype(problem.dtype), probabilities
         return Noise(problem, level, discrete_laws, few_outcomes)
@@ -81,11 +82,13 @@ class Noise(eqx.Module):
         draw_index: Any,
         cuts: UInt32[Array | np.ndarray, "n cuts"],
     ) -> tuple[Float[Array, " n"], Bool[Array, "n outcomes"]]:
-        """The variables `x` drawn from the key and this index, and which outcomes they
-        have. A variable has outcome `k` if its random word is not below `k` of its `cuts`,
-        as from `cuts_of`, and below all others."""
+        """Draws the variables by this key. Other indices and levels give independent draws.
+        Returns the values of the variables, and for each variable which of its outcomes it
+        has. By `cuts`, as from `cuts_of`, a random word that is at or above `k` of the cuts
+        of its variable gives outcome `k`."""
+        # These two numbers stand for the position of a step.
         place = draw_index, jnp.asarray(self.level.index)
-        # One random word for each variable, from a single block of words.
+        # One set of words, with one word for each variable.
         words = random_words(key, place, 1, len(self.laws))[0]
         outcome_numbers = jnp.sum(words[:, None] >= cuts, axis=1)
         # (n, outcomes)
@@ -96,17 +99,20 @@ class Noise(eqx.Module):
         return jnp.sum(jnp.where(has_outcome, values, 0), axis=1), has_outcome
 
     def weighted_nodes(self, x: Array | None = None) -> WeightedNodes:
-        """Nodes and weights of the expectation over the variables: all outcomes and their
-        probabilities, if there are few outcomes. Otherwise two nodes that estimate the
-        expectation from a draw `x`, or without a draw `2 * n + 1` nodes."""
-        if self.outcomes is not None:
-            return self.outcomes
+        """Nodes and weights of the expectation over the variables:
+
+        - if there are few outcomes, all of them with their probabilities;
+        - otherwise with a draw `x`, two nodes that estimate the expectation from it;
+        - otherwise `2 * n + 1` nodes of a quadrature.
+        """
+        if self.few_outcomes is not None:
+            return self.few_outcomes
         if x is not None:
             # The mean over a draw and its opposite is right for all odd functions.
             return jnp.stack([x, -x]), np.full(2, 0.5)
-        # Two nodes along each axis, at `sqrt(3)` standard deviations with weight 1/6, as in
-        # Gauss-Hermite quadrature, and zero, with the remainder of a total weight of one.
-        # They are exact for polynomials of degree 3, or 5 in one variable.
+        # As in Gauss-Hermite quadrature, there are two nodes along each axis, at `sqrt(3)`
+        # standard deviations with weight 1/6. The node at zero has the rest of the total
+        # weight of one. The sum is exact for polynomials of degree 3, or 5 in one variable.
         n = len(self.laws)
         nodes_on_axes = np.diag(np.sqrt(3 * self._variances()))
         nodes = np.concatenate([nodes_on_axes, -nodes_on_axes, np.zeros((1, n))])
@@ -114,13 +120,13 @@ class Noise(eqx.Module):
         return nodes.astype(self.problem.dtype), weights
 
     def mean(self, i: Any, y: Y, u: Function, x: Array | None = None) -> Array:
-        """The expectation of `u` after step `i` from `y`, over `weighted_nodes(x)`; NaN if
-        a step fails."""
+        """The expectation of `u` after step `i` from `y`, by the nodes and weights of
+        `weighted_nodes(x)`; NaN if a step fails."""
         nodes, weights = self.weighted_nodes(x)
         solver_state = self.new_solver_state(i, y)
 
-        def value(x: Array | np.ndarray) -> Array:
-            y1, _, success = self.step(i, y, solver_state, x)
+        def value(node: Array | np.ndarray) -> Array:
+            y1, _, success = self.step(i, y, solver_state, node)
             return jnp.where(success, u(y1), jnp.nan)
 
         values = jax.vmap(value)(nodes)
@@ -135,41 +141,41 @@ class Noise(eqx.Module):
         second_derivatives: Array | None,
         x: Array,
     ) -> tuple[Y, PyTree[Array], Bool[Array, ""], Array]:
-        """Step `i` of a path with variables `x`: the states of the path and of the solver
-        after it, whether it succeeded, and the control variate of `u`, whose mean over `x`
-        is zero. `second_derivatives` comes from `mean_second_derivatives`."""
-        if self.outcomes is not None:
-            outcomes_of_x, probabilities = self.outcomes
-            # A step for each outcome: the states of the path and of the solver after it.
-            step_by_outcome = jax.vmap(lambda x: self.step(i, y, solver_state, x))
-            ends, solver_states, success = step_by_outcome(outcomes_of_x)
+        """Takes step `i` of a path with variables `x`. Returns the states of the path and
+        of the solver after the step, whether the step succeeded, and the control variate of
+        `u`, whose mean over `x` is zero. `second_derivatives` comes from
+        `mean_second_derivatives`."""
+        if self.few_outcomes is not None:
+            all_outcomes, probabilities = self.few_outcomes
+            step_by_outcome = jax.vmap(ft.partial(self.step, i, y, solver_state))
+            ends, solver_states, success = step_by_outcome(all_outcomes)
             values = jax.vmap(u)(ends)
             mean = tensordot(probabilities.astype(values.dtype), values, 1)
-            # The path itself takes the outcome that is equal to `x`.
-            index_of_x = jnp.argmax(jnp.all(outcomes_of_x == x, axis=1))
+            # The path itself takes the step whose outcome is equal to `x`.
+            index_of_x = jnp.argmax(jnp.all(all_outcomes == x, axis=1))
             y1, next_solver_state, value = jtu.tree_map(
                 lambda of_outcomes: of_outcomes[index_of_x],
                 (ends, solver_states, values),
             )
-            # One failed outcome makes the mean wrong, and with it the control variate.
+            # If one of these steps fails, the mean is wrong, and so is the control variate.
             return y1, next_solver_state, jnp.all(success), value - mean
 
-        # By the formula of this class.
+        # There are many outcomes: by the formula in the docstring of this class.
         assert second_derivatives is not None
         y1, next_solver_state, success = self.step(i, y, solver_state, x)
         value_after = ft.partial(self._value_after, i, y, solver_state, u)
         first_derivatives = jax.jacrev(value_after)(jnp.zeros_like(x))
-        # The second derivatives `C`, multiplied by this matrix and summed over both axes,
-        # are `x^T C x - tr(C Sigma)`.
+        # Multiplied by the second derivatives `C` entry by entry, and summed over all
+        # entries, this is `x^T C x - tr(C Sigma)`.
         centred_square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
         linear = tensordot(first_derivatives, x, 1)
         quadratic = tensordot(centred_square, second_derivatives, 2) / 2
         return y1, next_solver_state, success, linear + quadratic
 
     def mean_second_derivatives(self, i: Any, ys: Y, u: Function) -> Array | None:
-        """The mean of the second derivatives of `u` after step `i` along the variables,
-        over the states `ys` before it; `None` if there are few outcomes."""
-        if self.outcomes is not None:
+        """The second derivatives of `u` after step `i` along the variables, averaged over
+        the states `ys` before the step; `None` if there are few outcomes."""
+        if self.few_outcomes is not None:
             return None
         zero = jnp.zeros(len(self.laws), self.problem.dtype)
 
@@ -194,13 +200,13 @@ class Noise(eqx.Module):
     def step(
         self, i: Any, y: Y, solver_state: PyTree[Array], x: Array | np.ndarray
     ) -> tuple[Y, PyTree[Array], Bool[Array, ""]]:
-        """`Problem.step` with these variables."""
+        """`Problem.step` with these values of the variables."""
         terms = self.problem.variables(self.level.h).terms_with(x)
         return self.problem.step(terms, i, self.level.h, y, solver_state)
 
     def new_solver_state(self, i: Any, y: Y) -> PyTree[Array]:
-        """The state of a solver that starts at step `i`. It is used in fits, which affect
-        only the variance; paths carry their own solver state."""
+        """The state of a solver that starts anew at step `i`. Fits start one in each step,
+        which affects only the variance. Paths start one in step 0, and carry it along."""
         no_noise = np.zeros(len(self.laws))
         terms = self.problem.variables(self.level.h).terms_with(no_noise)
         solver_state = self.problem.init(terms, i, self.level.h, y)
@@ -214,10 +220,10 @@ class Noise(eqx.Module):
 
 
 def _hidden_if_result(x: Array) -> Array:
-    """An array of a solver's state, hidden from XLA behind a barrier if it is an integer:
-    the result of a solve, which is a constant in a new state. XLA would evaluate what
-    follows from this constant for all states and outcomes while compiling: for 6,300 states
-    and 27 outcomes for more than a second, with an alarm."""
+    """Hides an array of a solver's state from XLA behind a barrier if the array is an
+    integer. An integer is the result of a solve, and in a new state it is a constant. While
+    compiling, XLA would evaluate for all states and outcomes what follows from this
+    constant: for 6,300 states and 27 outcomes it took more than a second, with an alarm."""
     is_result = jnp.issubdtype(x.dtype, jnp.integer)
     return jax.lax.optimization_barrier(x) if is_result else x
 
@@ -225,18 +231,18 @@ def _hidden_if_result(x: Array) -> Array:
 def cuts_of(
     probabilities: Sequence[Sequence[float] | Float[np.ndarray, " outcomes"]],
 ) -> UInt32[np.ndarray, "n cuts"]:
-    """The cuts between the random words of the outcomes of variables, from the
-    probabilities of the outcomes of each."""
+    """For each variable the random words that are the cuts between its outcomes, from the
+    probabilities of its outcomes."""
     cumulative = padded([np.cumsum(p) for p in probabilities])[:, :-1]
-    # A cut of 2^32 is no word, and the largest word takes its place. (The one random word
-    # that reaches this cut has the number of an outcome past the last, which `padded` makes
-    # equal to the last.)
+    # A variable with fewer outcomes than others has cuts at 2^32, which is no word, and the
+    # largest word takes its place. (If this word is drawn, the number of the outcome is
+    # past the last outcome of the variable, where `padded` has a copy of the last one.)
     largest_word = np.iinfo(np.uint32).max
     return np.minimum(np.round(cumulative * 2.0**32), largest_word).astype(np.uint32)
 
 
 def padded(rows: Sequence[np.ndarray]) -> np.ndarray:
-    """The rows as one array, each with its last entry in place of those that it lacks."""
+    """Stacks the rows, with shorter rows extended by copies of their last entry."""
     most = max(map(len, rows))
     return np.stack([np.pad(row, (0, most - len(row)), mode="edge") for row in rows])
 
@@ -247,7 +253,7 @@ def count_outcomes(problem: Problem) -> int | None:
         noise = Noise.of(problem, problem.level(0))
     except ValueError:
         return None
-    if noise.outcomes is None:
+    if noise.few_outcomes is None:
         return None
-    values, _ = noise.outcomes
+    values, _ = noise.few_outcomes
     return len(values)

@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 from ..._products import dot
 
 
-# The normal equations have the square of the condition number of a fit, and rounding might
-# leave them without a Cholesky factor. So a ridge of this many roundings is added to their
-# diagonal.
+# The condition number of the normal equations is the square of that of a fit, and rounding
+# might leave them without a Cholesky factor. So a ridge of this many times the rounding
+# error of one is added to their diagonal.
 _ROUNDINGS_IN_RIDGE = 1e4
 # How often the solution is refined. Along an axis with the eigenvalue s, each refinement
 # multiplies the error that a ridge of size r causes by r / (s + r).
@@ -38,12 +38,12 @@ def num_polynomials(d: int, degree: int) -> int:
 
 
 def hermite(x: Float[Array, " d"], degree: int) -> list[Float[Array, ""]]:
-    """Products of normalized Hermite polynomials, in the order of `exponents`. Each is a
-    product of two known factors, so that a sum over them compiles to one loop without
-    temporary arrays."""
+    """The values at `x` of products of normalized Hermite polynomials, in the order of
+    `exponents`. Each is computed as the product of an earlier one and a polynomial in one
+    variable. A sum over all of them then compiles to one loop without temporary arrays."""
     factors = [_hermite_of_one_variable(variable, degree) for variable in x]
-    # Products of several variables, by their exponents. Lower degrees come first, so the
-    # product without its last variable is known.
+    # Products by their exponents. Lower degrees come first, so the product without its last
+    # variable is known.
     products = {(0,) * len(x): jnp.ones_like(x[0])}
     for powers in exponents(len(x), degree)[1:]:
         last_variable = max(j for j, power in enumerate(powers) if power > 0)
@@ -56,8 +56,8 @@ def hermite(x: Float[Array, " d"], degree: int) -> list[Float[Array, ""]]:
 def _hermite_of_one_variable(
     x: Float[Array, ""], degree: int
 ) -> list[Float[Array, ""]]:
-    """The normalized Hermite polynomials of degrees 0, 1, ..., and of degree 1 in any case,
-    by their recurrence `sqrt(k + 1) h[k + 1] = x h[k] - sqrt(k) h[k - 1]`."""
+    """The normalized Hermite polynomials of degrees 0, 1, ... up to `degree` (or to 1 if it
+    is 0), by their recurrence `sqrt(k + 1) h[k + 1] = x h[k] - sqrt(k) h[k - 1]`."""
     polynomials = [jnp.ones_like(x), x]
     for k in range(1, degree):
         unscaled = x * polynomials[-1] - math.sqrt(k) * polynomials[-2]
@@ -68,11 +68,12 @@ def _hermite_of_one_variable(
 def least_squares(
     B: Float[Array, "n P"], values: Float[Array, "n m"], sizes: Sequence[int]
 ) -> Float[Array, "P fits m"]:
-    """The coefficients of several fits to the values, of which fit `k` uses the first
-    `sizes[k]` polynomials and has zeros for the others.
+    """The coefficients of several least-squares fits to `values` at `n` points, where `B`
+    has the values of `P` polynomials. Fit `k` uses the first `sizes[k]` polynomials, and
+    has zeros for the coefficients of the others.
 
     The normal equations are regularized, and the solution is refined. If the polynomials
-    are linearly independent at the points, only rounding errors remain; if not, the
+    are linearly independent at the points, only rounding errors remain. If not, the
     solution stays small.
     """
     # Columns are scaled to length one, so that one ridge suits all.
@@ -84,9 +85,9 @@ def least_squares(
     ridge_matrix = ridge * jnp.eye(num_columns, dtype=B.dtype)
     L = jnp.linalg.cholesky(dot(scaled_B.T, scaled_B) + ridge_matrix)
 
-    # A fit with fewer polynomials has a leading block of the normal equations, and its
-    # Cholesky factor is the leading block of `L`. So one factorization serves all fits. The
-    # rest of each factor is filled with the identity, so that all have the same shape.
+    # A fit with fewer polynomials has a leading block of the normal equations. The Cholesky
+    # factor of the block is the leading block of `L`, so one factorization serves all fits.
+    # The rest of each factor is filled with the identity, so that all have the same shape.
     # (fits, P)
     is_used = np.arange(num_columns) < np.array(sizes)[:, None]
     # (fits, P, P)
@@ -97,6 +98,7 @@ def least_squares(
         return jax.scipy.linalg.cho_solve((factor, True), rhs)
 
     def refine(_, c: Float[Array, "fits P m"]) -> Float[Array, "fits P m"]:
+        """Adds the solution for what the coefficients leave of the values."""
         # (fits, n, m)
         residual = values - dot(scaled_B, c)
         rhs = jnp.where(is_used[:, :, None], dot(scaled_B.T, residual), 0)
@@ -107,5 +109,5 @@ def least_squares(
     c = jax.lax.fori_loop(0, _REFINEMENTS, refine, no_fit)
     # (P, fits, m)
     c = jnp.moveaxis(c, 0, 1)
-    # From the coefficients of the scaled polynomials to those of the caller's.
+    # From the coefficients of the scaled columns to those of the columns of `B`.
     return c / lengths[:, None, None]

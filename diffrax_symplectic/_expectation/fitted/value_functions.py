@@ -37,12 +37,12 @@ from .fits import fit, FittedFunctions, room_for_steps
 from .mixture import Mixture
 
 
-# Folded into the key of a call to draw trials. (Numbers of levels, which are folded into it
-# to draw fits, are smaller.)
+# Folded into the key of a call to draw the trial. (For the pilot run of a level the number
+# of the level is folded into it. Numbers of levels are smaller.)
 _TRIAL_KEY = 0xFFFFFFFE
 # The most numbers that a fit computes without a warning that it will take long.
 _MOST_WITHOUT_WARNING = 2**31
-# From the code that calls `expectation` to `prepare`, counted as for `warnings.warn`.
+# The `stacklevel` of warnings in `prepare` that point to the code that calls `expectation`.
 _FRAMES_TO_USER = 6
 
 
@@ -105,35 +105,32 @@ class ValueFunctions(AbstractSampling):
                 "`sampling=IndependentPaths(num_paths)`.",
                 stacklevel=_FRAMES_TO_USER,
             )
-        basis = chosen.basis
-        outputs = Outputs.of(problem)
+
         levels = range(len(problem.levels.h))
-        functions = _fits(problem, key, basis, room_for_steps(problem), levels)
-        mixture = Mixture.of(problem)
+        functions = _fits(problem, key, chosen.basis, room_for_steps(problem), levels)
 
-        def plan_for(
-            is_used: Bool[np.ndarray, "S m"], mixture: Mixture, num_samples: int
-        ) -> SamplingPlan:
+        def sampler_for(
+            is_used: Bool[np.ndarray, "S m"], mixture: Mixture
+        ) -> jtu.Partial:
             # A `Partial` is a PyTree: a program is compiled once for all arrays in it.
-            sampler = jtu.Partial(
-                controlled_paths, problem, functions, is_used, mixture
-            )
-            return SamplingPlan(
-                sampler,
-                outputs,
-                num_samples=num_samples,
-                batch_size=self.batch_size,
-                # These few paths take less time than compiling their program.
-                is_quick=True,
-            )
+            return jtu.Partial(controlled_paths, problem, functions, is_used, mixture)
 
-        # A trial, whose paths are not part of the estimate.
+        # A trial of the control variate for all means, by one batch of paths that are not a
+        # part of the estimate.
+        all_laws = Mixture.of(problem)
         always_used = np.ones(problem.output_shape, bool)
-        trial_plan = plan_for(always_used, mixture, self.batch_size)
+        trial_plan = SamplingPlan(
+            sampler_for(always_used, all_laws),
+            Outputs.of(problem),
+            num_samples=self.batch_size,
+            batch_size=self.batch_size,
+            # So few paths take less time than compiling their program.
+            is_quick=True,
+        )
         trial = run(trial_plan, jr.fold_in(key, _TRIAL_KEY), devices)
         is_used, remainder = _comparison(trial, problem)
         if self.degree == 0:
-            # No control variate was asked for.
+            # The user asked for no control variate.
             is_used = np.zeros(problem.output_shape, bool)
         elif self.degree is not None and not np.any(is_used):
             warnings.warn(
@@ -141,24 +138,29 @@ class ValueFunctions(AbstractSampling):
                 "used. Pass another `degree`, or another `sampling`.",
                 stacklevel=_FRAMES_TO_USER,
             )
-        # The mixture draws some paths by wider laws than the own one of the noise. If paths
-        # of the trial fail, such paths fail far more often, and show nothing of the rare
-        # paths for which they are there.
-        if trial.num_failed > 0 or not np.any(is_used):
-            mixture = mixture.own_law_alone()
-        plan = plan_for(is_used, mixture, self.num_paths)
-        return plan._replace(
-            reason=_choice_in_words(basis, is_used),
+        # Half of the paths draw by wider laws, to show the rare paths for which the fit may
+        # be poor. If paths of the trial fail, paths by wider laws fail far more often, and
+        # do not show rare paths.
+        needs_own_law = trial.num_failed > 0 or not np.any(is_used)
+        laws = all_laws.own_law_alone() if needs_own_law else all_laws
+
+        plan = trial_plan._replace(
+            sampler=sampler_for(is_used, laws),
+            num_samples=self.num_paths,
+            reason=_choice_in_words(chosen.basis, is_used),
             remainder=remainder,
-            with_halved_steps=(
-                ft.partial(_with_halved_steps, plan, key) if chosen.is_quick else None
-            ),
+        )
+        if not chosen.has_quick_fit:
+            return plan
+        return plan._replace(
+            with_halved_steps=ft.partial(_with_halved_steps, plan, key)
         )
 
 
 def _choice_in_words(basis: AbstractBasis, is_used: Bool[np.ndarray, "S m"]) -> str:
-    """The degree or the number of grid points, and whether all means use it, for the
-    result. Zero stands for no control variate."""
+    """Says for the result which degree, or number of grid points, the control variates
+    have: `degree: 0, 4, chosen among 0, 4` if some means use degree 4, and others no
+    control variate, for which zero stands."""
     used = np.unique(np.where(is_used, basis.resolution, 0))
     options = np.unique([0, basis.resolution])
     return (
@@ -169,7 +171,8 @@ def _choice_in_words(basis: AbstractBasis, is_used: Bool[np.ndarray, "S m"]) -> 
 
 def _with_halved_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
     """A plan of `ValueFunctions` with halved steps on all levels. Only the last level is
-    fitted: each other level now has the steps of the one after it, and takes its fit."""
+    fitted: each other level now has the steps of the next level of `plan`, and takes the
+    functions of that level."""
     problem, functions, *others = plan.sampler.args  # pyright: ignore (a `Partial`)
     finer_problem = problem.with_halved_steps()
     num_levels, most_steps, *_ = functions.coefficients.shape
@@ -185,15 +188,17 @@ def _with_halved_steps(plan: SamplingPlan, key: PRNGKeyArray) -> SamplingPlan:
 def _comparison(
     trial: Expectation, problem: Problem
 ) -> tuple[Bool[np.ndarray, "S m"], float]:
-    """For which times and components the control variate of a trial is better than none;
-    and the largest fraction of a standard error that remains with it."""
+    """Compares the standard errors of a trial with and without the control variate.
+    Returns for which times and components the control variate reduces the standard error,
+    and the largest fraction of a standard error that remains."""
     result = combined_results(trial, Combination.BEST)
-    # A fit whose error is NaN has failed.
+    # Where the fit has failed, the error is NaN.
     errors = np.nan_to_num(result.std_error, nan=np.inf)
     plain_errors = result.plain_std_error
-    # Written as a negation, so that a fit is used if the error without it is NaN.
+    # A negation, so that the fit is used where the error without it is NaN.
     is_used = ~(errors >= plain_errors)
-    # Where nothing is random, as for a constant `phi`, both errors are rounding errors.
+    # Where nothing is random, as for a constant `phi`, both errors are rounding errors,
+    # whose fraction means nothing.
     rounding = ROUNDING * np.finfo(problem.dtype).eps * np.abs(result.mean)
     is_random = plain_errors > rounding
     fractions = np.minimum(errors, plain_errors)[is_random] / plain_errors[is_random]
@@ -207,21 +212,24 @@ def _fits(
     most_steps: int,
     levels: Sequence[int],
 ) -> FittedFunctions:
-    """The fits of levels with these numbers, in arrays for `most_steps` steps."""
+    """The functions fitted on the levels with these numbers, in arrays with room for
+    `most_steps` steps."""
 
     def fits_by(solver: diffrax.AbstractSolver) -> tuple[FittedFunctions, int]:
-        """The fits by this solver, and how many of the pilot's paths failed."""
+        """The functions fitted by this solver, and how many paths of the pilots failed."""
         solved = dataclasses.replace(problem, solver=solver)
-        # An integer would be static: a program for each level.
+        # The number of a level is an array: an integer would be static, and each level
+        # would compile its own program.
         fits = [fit(solved, np.array(k), key, basis, most_steps) for k in levels]
         functions_of_levels, failures_of_levels = zip(*fits)
         # The numbers are traced if a function of the user closes over traced values.
         check_untraced("`expectation`", failures_of_levels)
         return _joined(functions_of_levels), sum(map(int, failures_of_levels))
 
-    # Newton's method is a quarter of the time to compile a fit, and few of its states need
-    # it. A state at which the sweeps fail is left out of the fit. But if paths of the pilot
-    # fail, steps are too long for sweeps: the fit is made again, with Newton's method.
+    # Newton's method would take a quarter of the time to compile a fit, and is needed only
+    # at the few states at which fixed-point sweeps fail. So a fit leaves out these states.
+    # But if paths of the pilot fail, steps are too long for sweeps alone, and the fit is
+    # made again with Newton's method.
     functions, num_failed = fits_by(without_newton(problem.solver))
     if num_failed > 0 and has_newton(problem.solver):
         functions, _ = fits_by(problem.solver)
@@ -229,7 +237,7 @@ def _fits(
 
 
 def _joined(functions_of_levels: Sequence[FittedFunctions]) -> FittedFunctions:
-    """The functions of several levels, each with a leading axis of levels, as one."""
+    """Joins the functions of several levels along their leading axis, that of levels."""
     if len(functions_of_levels) == 1:
         return functions_of_levels[0]
     return jtu.tree_map(lambda *xs: jnp.concatenate(xs), *functions_of_levels)

@@ -1,4 +1,9 @@
-"""Array-RQMC: all paths of a randomization step together, sorted before each step."""
+"""Array-RQMC: all paths of a replicate take each step together, and are sorted before it.
+
+A replicate is one randomization of a set of quasi-random points, with one point for each
+path. A coordinate of a point is a random word: a uniformly distributed integer of 32 bits,
+from which a Brownian path computes a random variable of the step.
+"""
 
 import functools as ft
 import math
@@ -31,6 +36,7 @@ from ..._simulation import (
     Level,
     mask_like,
     Motion,
+    PathStates,
     Problem,
     real_vector,
     simulate,
@@ -50,7 +56,7 @@ from .hilbert import hilbert_order
 from .points import balanced_in_sixths, num_seeds, scrambled, sobol_points
 
 
-# SciPy has direction numbers for this many coordinates of Sobol' points.
+# The most coordinates of Sobol' points: SciPy has direction numbers for this many.
 _MAX_DIMENSION = 21201
 # The fewest replicates after which an estimate with `tol` may stop. Fewer do not estimate
 # their variance well enough: the error bar of eight is uncertain by a quarter.
@@ -106,25 +112,16 @@ class ArrayRQMC(AbstractSampling):
                 f"`ArrayRQMC` takes 1 to {_MAX_DIMENSION:,}, the dimensions of Sobol' "
                 "points. Pass `sampling=IndependentPaths(num_paths)`."
             )
+
         sort_function = _state_itself if self.sort_by is None else self.sort_by
         check_takes("sort_by", sort_function, "y")
         sort_by = traced(sort_function, problem.y0)
-        coordinates = jax.eval_shape(sort_by, problem.y0)
-        check_real("sort_by", jtu.tree_leaves(coordinates))
-        num_coordinates = jax.eval_shape(lambda: real_vector(sort_by(problem.y0))).size
+        coordinates = jtu.tree_leaves(jax.eval_shape(sort_by, problem.y0))
+        check_real("sort_by", coordinates)
+        num_coordinates = sum(leaf.size for leaf in coordinates)
         check_memory("num_paths", self.num_paths, problem.bytes_of_state, devices[0])
-        # If the paths fill a cube, with equal distances along all coordinates.
-        num_along_coordinate = self.num_paths ** (1 / num_coordinates)
-        if num_along_coordinate < _FEWEST_ALONG_COORDINATE:
-            most_coordinates = int(math.log(self.num_paths, _FEWEST_ALONG_COORDINATE))
-            warnings.warn(
-                f"{self.num_paths:,} paths are sorted by {num_coordinates} coordinates, "
-                f"which leaves {num_along_coordinate:.1f} along each: neighbours are far "
-                "apart, and `ArrayRQMC` gains little over `IndependentPaths`. Pass a "
-                "`sort_by` that returns the few coordinates that matter most, at most "
-                f"{most_coordinates}.",
-                stacklevel=6,
-            )
+        _warn_if_far_apart(self.num_paths, num_coordinates)
+
         points = jnp.asarray(sobol_points(self.num_paths, layout.num_words))
 
         def sampler_for(problem: Problem) -> jtu.Partial:
@@ -139,10 +136,27 @@ class ArrayRQMC(AbstractSampling):
             paths_per_sample=self.num_paths,
             least_samples=_LEAST_REPLICATES,
         )
-        # With halved steps the program is the same.
+        # Halved steps need no other program, so they are always offered.
         finer_sampler = sampler_for(problem.with_halved_steps())
         with_halved_steps = ft.partial(plan._replace, sampler=finer_sampler)
         return plan._replace(with_halved_steps=with_halved_steps)
+
+
+def _warn_if_far_apart(num_paths: int, num_coordinates: int) -> None:
+    """Warns if neighbours among so many paths, sorted by so many coordinates, are far
+    apart."""
+    # The number of paths along each edge of a cube that all paths fill evenly.
+    num_along_coordinate = num_paths ** (1 / num_coordinates)
+    if num_along_coordinate < _FEWEST_ALONG_COORDINATE:
+        most_coordinates = int(math.log(num_paths, _FEWEST_ALONG_COORDINATE))
+        warnings.warn(
+            f"{num_paths:,} paths are sorted by {num_coordinates} coordinates, which "
+            f"leaves {num_along_coordinate:.1f} along each: neighbours are far apart, and "
+            "`ArrayRQMC` gains little over `IndependentPaths`. Pass a `sort_by` that "
+            f"returns the few coordinates that matter most, at most {most_coordinates}.",
+            # To the code that calls `expectation`.
+            stacklevel=7,
+        )
 
 
 def _samples_of_replicate(
@@ -152,63 +166,66 @@ def _samples_of_replicate(
     layout: "WordLayout",
     keys: Key[Array, "1"],
 ) -> Samples:
-    """A sample is the mean over all paths of a replicate, by algorithm 1 of
+    """Takes one sample: the mean over all paths of a replicate, by algorithm 1 of
     [L'Ecuyer, Lécot and Tuffin (2008)](https://doi.org/10.1287/opre.1080.0556).
 
     `points` come from `sobol_points`, one for each path, with a coordinate for each random
-    variable of a step.
+    word of a step.
     """
     n, d = points.shape
     (replicate_key,) = keys
+    # The outer values of a three-point variable have probability 1/6 each, and a sixth of
+    # the points, whose number is a power of two, is not a whole number. So a single such
+    # variable is balanced in blocks of six points instead.
+    is_one_three_point = layout.is_one_three_point_variable
+    randomized = balanced_in_sixths if is_one_three_point else scrambled
     # Starts are independent, rather than from Sobol' points, since a function of a key may
     # draw any number of random variables.
     start_keys = jr.split(jr.fold_in(replicate_key, _KEY_OF_STARTS), n)
     starts = jax.vmap(problem.draw_start)(start_keys)
 
     def motion_on(level: Level) -> Motion:
-        """The motion of all paths, which are sorted before each step."""
+        """The motion of all paths on a level: sorting before each step, and the step."""
 
-        def words_of_paths(i: Any) -> UInt32[Array, "n d"]:
-            # The points are scrambled anew on each level and in each step.
+        def words_of_step(i: Any) -> UInt32[Array, "n d"]:
+            """The random words of step `i`, with a row for each path."""
+            # The points are randomized anew on each level and in each step.
             key = jr.fold_in(jr.fold_in(replicate_key, level.index), i)
             seeds = jr.bits(key, (num_seeds(d),), jnp.uint32)
-            # The outer values of this variable have probability 1/6 each, but a sixth of a
-            # power of two of points is not a whole number.
-            if layout.is_one_three_point_variable:
-                return balanced_in_sixths(points, seeds)
-            return scrambled(points, seeds)
+            return randomized(points, seeds)
 
-        # Given their words, paths move independently. Only the words are coupled: a sorted
-        # path gets those of its place in the order.
-        motion = independent_motion(
+        # Paths with given words move independently of each other.
+        unsorted_motion = independent_motion(
             problem,
             level,
             starts,
             terms_of=lambda words: with_words(problem.terms, layout, words),
-            randomness_of_step=words_of_paths,
+            randomness_of_step=words_of_step,
         )
 
-        def step(i, paths):
+        def sort_and_step(i: Any, paths: PathStates) -> PathStates:
             coordinates = jax.vmap(lambda y: real_vector(sort_by(y)))(paths.y)
-            # Failed paths come last.
-            order = hilbert_order(coordinates, paths.failed)
-            return motion.step(i, jtu.tree_map(lambda x: x[order], paths))
+            order = hilbert_order(coordinates, is_last=paths.failed)
+            # Path `j` in this order takes row `j` of the words.
+            sorted_paths = jtu.tree_map(lambda x: x[order], paths)
+            return unsorted_motion.step(i, sorted_paths)
 
-        return Motion(step, motion.start)
+        return Motion(sort_and_step, unsorted_motion.start)
 
-    simulated = simulate(problem, motion_on, _statistics)
-    # From (levels, S, 3, m), with the three numbers of `_statistics`, to (3, levels, S, 1,
-    # m), with an axis for the only sample.
+    simulated = simulate(problem, motion_on, measure=_statistics)
+    # The saved array has the shape (levels, S, 3, m), with the three rows of `_statistics`.
+    # They become the first axis, and the only sample of this call gets an axis of its own:
+    # (3, levels, S, 1, m).
     statistics = jnp.moveaxis(simulated.saved[:, :, :, None], 2, 0)
-    # (levels, 1, numbers)
+    # (levels, 1, numbers) each.
     mean_on_levels, r, largest = map(as_vectors, statistics)
     mean = combinations(problem.weights, mean_on_levels)
     averaged = Averaged(
         mean,
-        # The largest `r` on any level, for all combinations.
+        # All combinations of levels get the largest `r` on any level.
         heaviness=jnp.broadcast_to(jnp.max(r, axis=0), mean.shape),
-        # An upper bound of how far a path deviates in a combination of levels, which is
-        # reached if one path has the largest deviation on all of them.
+        # An upper bound of the deviation of a path in a combination of levels. It is
+        # reached if one path has the largest deviation on all levels.
         largest=combinations(abs(problem.weights), largest),
     )
     num_failed = jnp.sum(simulated.failed, axis=1, keepdims=True)
@@ -218,15 +235,20 @@ def _samples_of_replicate(
 
 
 def _statistics(phi: Float[Array, "n m"], failed: Bool[Array, " n"]) -> Array:
-    """The mean over the paths that have not failed, their `heaviness`, and the largest
-    deviation of one of them from the mean, along a leading axis. The number of paths is a
-    power of two."""
+    """Three statistics of the paths that have not failed, as three rows of shape `(m,)`:
+
+    - the mean of `phi`;
+    - the `heaviness` of the tails of `phi`;
+    - the largest deviation of a path from the mean.
+
+    The number `n` of paths is a power of two.
+    """
     is_good = mask_like(~failed, phi)
     num_good = jnp.sum(~failed).astype(phi.dtype)
 
     def mean_of_good(x: Float[Array, "n m"]) -> Float[Array, " m"]:
-        # The sum has two stages, so that rounding errors in single precision do not add up.
-        # About the root of the number of paths are summed in each.
+        # The sum has two stages, of about `sqrt(n)` terms each: in single precision the
+        # rounding errors of a single sum of `n` terms would add up.
         num_rows = 2 ** ((len(x).bit_length() - 1) // 2)
         rows = jnp.where(is_good, x, 0).reshape(num_rows, -1, *x.shape[1:])
         return jnp.sum(jnp.sum(rows, axis=0), axis=0) / num_good
@@ -234,23 +256,23 @@ def _statistics(phi: Float[Array, "n m"], failed: Bool[Array, " n"]) -> Array:
     mean = mean_of_good(phi)
     deviations = jnp.where(is_good, jnp.abs(phi - mean), 0)
     largest = jnp.max(deviations, axis=0)
-    # The standard deviation is in units of the largest deviation, which is then 1, so that
+    # The heaviness is the same in any units. With the largest deviation as the unit,
     # squares neither overflow nor underflow.
-    scaled = deviations / jnp.where(largest > 0, largest, 1)
-    s = jnp.sqrt(mean_of_good(scaled**2))
-    # Deviations that are rounding errors can have heavy tails, too, which do not count.
+    scaled_deviations = deviations / jnp.where(largest > 0, largest, 1)
+    scaled_std = jnp.sqrt(mean_of_good(scaled_deviations**2))
+    r = heaviness(largest=1, s=scaled_std, n=num_good, numpy=jnp)
+    # Deviations that are only rounding errors, or zero, do not count as heavy tails.
     is_random = largest > ROUNDING * jnp.finfo(phi.dtype).eps * jnp.abs(mean)
-    r = jnp.where(is_random, heaviness(1, s, num_good, jnp), 0)
-    return jnp.stack([mean, r, largest])
+    return jnp.stack([mean, jnp.where(is_random, r, 0), largest])
 
 
 class WordLayout(NamedTuple):
-    """Which random words of a step each Brownian path in `terms` takes.
+    """Which of the random words of a step each Brownian path in `terms` takes.
 
-    - `slices`: the first word of each path, and one past the last.
-    - `num_words`: the number of all words.
-    - `is_one_three_point_variable`: whether nothing else is drawn. Then the words are
-        `balanced_in_sixths`.
+    - `slices`: for each path, the indices of its first word and of one past its last.
+    - `num_words`: the number of words in a step.
+    - `is_one_three_point_variable`: whether a step has a single random variable, with three
+        values.
     """
 
     slices: tuple[tuple[int, int], ...]
@@ -259,11 +281,11 @@ class WordLayout(NamedTuple):
 
 
 def word_layout(terms: PyTree[diffrax.AbstractTerm]) -> WordLayout:
-    """The layout of the words of a step. Equal paths are one Brownian motion, and take the
-    same words. Raises a `ValueError` for a path whose increments cannot be computed from
-    words."""
+    """The layout of the words of a step. Equal paths in `terms` are one Brownian motion,
+    and take the same words. Raises a `ValueError` for a path whose increments cannot be
+    computed from words."""
     paths = [checked_stepwise(path) for path in brownian_paths(terms)]
-    # The first word of each Brownian motion, by its number.
+    # The index of the first word of each Brownian motion, by the number of the motion.
     first_words: dict[int, int] = {}
     slices: list[tuple[int, int]] = []
     num_words = 0
@@ -282,7 +304,8 @@ def with_words(
     layout: WordLayout,
     words: UInt32[Array, " num_words"],
 ) -> PyTree[diffrax.AbstractTerm]:
-    """The terms, with paths whose increments are computed from these words of one step."""
+    """The terms for one step of one path, with Brownian paths whose increments are computed
+    from the words of this step."""
     # `replace_paths` visits paths in the order of `brownian_paths`.
     slices = iter(layout.slices)
 
@@ -301,12 +324,13 @@ def _increment_from_words(
     t1: Any,
     use_levy: bool,
 ) -> Increment:
-    """The increment of the path, computed from the first of these words."""
+    """The increment of the path from `t0` to `t1`, computed from its words of this step.
+    With `use_levy=False` only the first of the words may be needed."""
     return path.increment(words[: path.num_words(use_levy)], t0, t1, use_levy)
 
 
 def _state_itself(y: Y) -> Y:
-    """The default of `sort_by`."""
+    """The function `sort_by` that is used by default: it returns the state."""
     return y
 
 

@@ -1,5 +1,9 @@
 """The order of states along Hilbert's curve, in which neighbours are close to each other in
-state space."""
+state space.
+
+A grid of cells covers nearly all states. The curve visits each cell once, and the place of
+a cell is its number along the curve. States are sorted by the places of their cells.
+"""
 
 from typing import Any
 
@@ -9,11 +13,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int32, UInt, UInt32
 
 
-# The most bits of a coordinate that sorting uses: 16 bits are 65,536 cells along each axis,
-# four times the default number of paths. Each bit costs some operations on all paths.
+# There are at most `2**_COORDINATE_BITS` cells along each axis: 65,536, which is four times
+# the default number of paths. Each bit costs some operations on all paths.
 _COORDINATE_BITS = 16
-# The range of a coordinate is estimated from about this many states, of which this share is
-# left out at either end. It need not be accurate, since the grid is three times as wide.
+# The range of each coordinate is estimated from about this many states, of which this share
+# is left out at either end. The estimate need not be accurate, since the grid is three
+# times as wide as the range.
 _SAMPLE_SIZE = 256
 _SHARE_OF_OUTLIERS = 1 / 50
 
@@ -27,40 +32,42 @@ def hilbert_order(
     rows = jnp.arange(n, dtype=jnp.int32)
     has_64_bits = jnp.result_type(float) == np.float64
     dtype = np.uint64 if has_64_bits else np.uint32
+    # On CPUs XLA sorts a single array of unsigned integers ten times as fast as anything
+    # else. So with 64 bits one integer holds both the place of a state and its row.
     row_bits = (n - 1).bit_length() if has_64_bits else 0
     # The highest bit marks the rows at the end.
-    total_bits = np.iinfo(dtype).bits - 1 - row_bits
+    place_bits = np.iinfo(dtype).bits - 1 - row_bits
     # Coordinates for which no bit is left are dropped.
-    d = min(num_coordinates, total_bits)
-    bits = min(_COORDINATE_BITS, total_bits // d)
+    d = min(num_coordinates, place_bits)
+    bits = min(_COORDINATE_BITS, place_bits // d)
     places = _places_on_curve(_cells(z[:, :d], bits), bits, dtype)
-    # Beyond all places on the curve.
-    places = jnp.where(is_last, dtype(2**total_bits), places)
+    # This number is beyond all places on the curve.
+    places = jnp.where(is_last, dtype(2**place_bits), places)
     if not has_64_bits:
         _, order = lax.sort((places, rows), num_keys=1)
         return order
-    # On CPUs XLA sorts a single array of unsigned integers ten times as fast as anything
-    # else, so the row's number is packed into the bits below its place on the curve.
+    # The number of the row is packed into the bits below its place.
     packed = jnp.sort((places << dtype(row_bits)) | rows.astype(dtype))
     return (packed & dtype(2**row_bits - 1)).astype(jnp.int32)
 
 
 def _cells(z: Float[Array, "n d"], bits: int) -> list[UInt32[Array, " n"]]:
-    """The coordinates of points as integers of so many bits, the cells of a grid.
+    """The cell of each state: for each coordinate, the number of the cell along this axis,
+    an integer of `bits` bits.
 
-    The grid is three times as wide as the range of nearly all states, and outliers are
-    clipped to its edges, so that they do not coarsen it.
+    The grid is three times as wide as the range of nearly all states. Outliers are clipped
+    to its edges, so that they do not make the cells larger.
     """
     z = jnp.nan_to_num(z)
-    # Some states at equal distances in `z`, of which each coordinate is sorted by itself.
+    # A sample of equally spaced rows, in which each coordinate is sorted by itself.
     stride = max(1, len(z) // _SAMPLE_SIZE)
     sample = jnp.sort(z[::stride], axis=0)
     num_outliers = int(len(sample) * _SHARE_OF_OUTLIERS)
     low = sample[num_outliers]
     high = sample[-1 - num_outliers]
     width = jnp.where(high > low, high - low, 1)
-    # The distance from the lower edge of the grid, in thirds of the grid: 1 at `low`, and 2
-    # at `high`.
+    # The distance from the lower edge of the grid, in thirds of its width: 1 at `low`, and
+    # 2 at `high`.
     thirds = (z - low) / width + 1
     positions = thirds * np.asarray(2.0**bits / 3, z.dtype)
     # Integers of at most 16 bits are exact in single precision.
@@ -71,13 +78,12 @@ def _cells(z: Float[Array, "n d"], bits: int) -> list[UInt32[Array, " n"]]:
 def _places_on_curve(
     cells: list[UInt32[Array, " n"]], bits: int, dtype: Any
 ) -> UInt[Array, " n"]:
-    """The place along Hilbert's curve of each cell, whose coordinates have so many bits, as
-    an integer of this dtype, by the algorithm of [Skilling
-    (2004)](https://doi.org/10.1063/1.1751381)."""
-    # In one dimension the curve is the line itself.
+    """The place of each cell along Hilbert's curve, as an integer of this dtype, by the
+    algorithm of [Skilling (2004)](https://doi.org/10.1063/1.1751381). `cells` has for each
+    coordinate the numbers of the cells along its axis, integers of `bits` bits."""
+    # In one dimension the curve is a line, so the place is the coordinate.
     transposed = cells if len(cells) == 1 else _transposed_place(cells, bits)
-    # The bits of the place are dealt out in turn to the numbers in `transposed`, the
-    # highest first. Here they are collected again.
+    # Collect the bits of the place, the highest first, from the numbers in turn.
     places = jnp.zeros(transposed[0].shape, dtype)
     for b in range(bits - 1, -1, -1):
         for number in transposed:
@@ -90,16 +96,17 @@ def _transposed_place(
     cells: list[UInt32[Array, " n"]], bits: int
 ) -> list[UInt32[Array, " n"]]:
     """The place along the curve in Skilling's transposed form: one number of `bits` bits
-    for each coordinate, to which the bits of the place are dealt out in turn. (This is
-    `AxestoTranspose` of the paper, with `x` for its `X`, `bit` for `Q`, `below` for `P` and
-    `flips` for `t`.)"""
+    for each coordinate. The bits of the place, from the highest to the lowest, are those of
+    these numbers in turn: the highest bit of each, then the second bit of each, and so on.
+    (This is `AxestoTranspose` of the paper, with `x` for its `X`, `bit` for `Q`, `below`
+    for `P` and `flips` for `t`.)"""
     x = [*cells]
     for b in range(bits - 1, 0, -1):
         bit = np.uint32(1 << b)
         below = np.uint32((1 << b) - 1)
         for i in range(len(x)):
-            # Invert the lower bits of the first coordinate, or exchange them with the lower
-            # bits of this one.
+            # If this bit of `x[i]` is set, invert the lower bits of `x[0]`. Otherwise
+            # exchange them with the lower bits of `x[i]`.
             is_inverted = (x[i] & bit) != 0
             exchanged = jnp.where(is_inverted, np.uint32(0), (x[0] ^ x[i]) & below)
             x[0] = x[0] ^ jnp.where(is_inverted, below, exchanged)
@@ -112,6 +119,6 @@ def _transposed_place(
     for b in range(bits - 1, 0, -1):
         below = np.uint32((1 << b) - 1)
         is_set = (x[-1] & np.uint32(1 << b)) != 0
-        # The bits of the last number flip all lower bits of all numbers.
+        # Each bit that is set in the last number flips all lower bits of all numbers.
         flips = flips ^ jnp.where(is_set, below, np.uint32(0))
     return [coordinate ^ flips for coordinate in x]
