@@ -19,26 +19,26 @@ from .._programs import compiled
 from .sampling import Averaged, Samples
 
 
-# The exponents of scales are at least this much below the largest of the dtype, so that
-# sums of 2^24 numbers of this size stay in range.
+# Powers of two that scale numbers have exponents at least this much below the largest of
+# the dtype, so that sums of 2^24 scaled numbers stay in range.
 _SPARE_EXPONENTS = 24
 # The name of the axis of devices.
 _DEVICE_AXIS = "samples"
 
 
 class BatchMoments(NamedTuple):
-    """What is known of the samples of a batch. Arrays in an `Averaged` have axes for
-    devices, combinations of levels, and numbers.
+    """Statistics of the samples of a batch. Arrays in an `Averaged` have axes for devices,
+    combinations of levels, and numbers of `phi`.
 
     - `num_good`: the number of good samples.
     - `num_failed`: the number of failed paths. A path that fails on several levels counts
         once.
     - `failed_on`: the number of paths that failed on each level.
-    - `any_failed`: whether any path failed, counted or not.
+    - `any_failed`: whether any path failed, with those that are not counted.
     - `mean`: the mean of the good samples.
-    - `mean_correction`: what rounding took from this mean. It is added in float64.
-    - `norm`: the root of the sum of squared deviations from the mean after its correction.
-    - `largest`: the largest deviation.
+    - `mean_correction`: the correction of the rounding of `mean`, to be added in float64.
+    - `norm`: the root of the sum of squared deviations from the corrected mean.
+    - `largest`: the largest absolute deviation from `mean`.
     - `size`: the largest absolute value.
     """
 
@@ -62,21 +62,23 @@ def _moments_on_devices(
     mesh: Mesh,
     samples_per_device: int,
 ) -> BatchMoments:
-    """The moments on all devices, along a leading axis. The first device begins with the
-    sample number whose low 32 bits are `low_high[0]`, and the high ones `low_high[1]`. Only
-    the first `num_wanted` samples of all devices together count."""
+    """The moments on all devices, along a leading axis. `low_high` are the low and the high
+    32 bits of the number of the batch's first sample. Only the first `num_wanted` samples
+    of all devices together count."""
 
     def moments_on_device(sampler, low_high, num_wanted, device):
-        # The places of the samples among those of all devices.
+        # The indices of this device's samples within the batch.
         index = device * samples_per_device + jnp.arange(samples_per_device)
-        # The number of each sample. (JAX may have no 64-bit integers.)
+        # The low and the high bits of the sample numbers. (JAX may have no 64-bit
+        # integers.)
         low = low_high[0] + index.astype(jnp.uint32)
         # The sum has wrapped around if it is less than one of its terms.
         has_carry = low < low_high[0]
         high = low_high[1] + has_carry.astype(jnp.uint32)
         key = jr.wrap_key_data(jnp.asarray(key_data), impl=key_impl)
         keys = jax.vmap(ft.partial(sample_key, key))(high, low)
-        # The last batch is cut here: another size would be another program.
+        # All batches have the same size, since another size would compile anew. In the last
+        # batch, some samples may not be wanted.
         return _moments_of(lapack_in_turn(sampler)(keys), index < num_wanted)
 
     if mesh.size == 1:
@@ -84,15 +86,15 @@ def _moments_on_devices(
         return jtu.tree_map(lambda x: x[None], moments)
     dynamic, static = eqx.partition(sampler, eqx.is_array)
 
-    # The devices do not communicate until the end, so each one's result does not depend on
-    # how many there are.
+    # Devices do not communicate until the end, so the moments on each do not depend on the
+    # number of devices.
     def gathered_moments(dynamic, low_high, num_wanted):
         sampler = eqx.combine(dynamic, static)
         device = jax.lax.axis_index(_DEVICE_AXIS)
         moments = moments_on_device(sampler, low_high, num_wanted, device)
         return jtu.tree_map(lambda x: jax.lax.all_gather(x, _DEVICE_AXIS), moments)
 
-    # Every device gets all arguments, and returns the moments of all.
+    # Every device gets all arguments, and returns the moments of all devices.
     whole = PartitionSpec()
     on_all_devices = jax.shard_map(
         gathered_moments, mesh=mesh, in_specs=whole, out_specs=whole, check_vma=False
@@ -117,36 +119,36 @@ quick_batch_moments = compiled(_moments_on_devices, quickly=True)
 
 
 def _moments_of(samples: Samples, is_wanted: Bool[Array, " n"]) -> BatchMoments:
-    """The moments of those samples of one device that are wanted."""
+    """The moments of the samples of one device that are wanted."""
     good = samples.good & is_wanted
     # (levels, samples)
     failures = jnp.where(is_wanted, samples.num_failed, 0)
-    num_failed_on_any = jnp.sum(jnp.max(failures, axis=0))
-    any_failed = num_failed_on_any > 0
+    num_failed = jnp.sum(jnp.max(failures, axis=0))
+    any_failed = num_failed > 0
     if samples.also_failed is not None:
         any_failed |= jnp.any(samples.also_failed & is_wanted)
     fields = samples.averaged.fields
-    # All fields are summed at once, since fewer operations compile sooner.
+    # The fields of `samples.averaged` are one array, since fewer operations compile sooner.
     moments_of_fields = _moments_of_fields(jnp.stack([*fields.values()]), good)
     averaged = [Averaged(**dict(zip(fields, x))) for x in moments_of_fields]
     failed_on = jnp.sum(failures, axis=1)
-    counts = jnp.sum(good), num_failed_on_any, failed_on, any_failed
-    return BatchMoments(*counts, *averaged)
+    return BatchMoments(jnp.sum(good), num_failed, failed_on, any_failed, *averaged)
 
 
 def _moments_of_fields(
     x: Float[Array, "fields combinations n numbers"], good: Bool[Array, " n"]
 ) -> tuple[Float[Array, "fields combinations numbers"], ...]:
-    """The fields of `BatchMoments` that are an `Averaged`, in their order."""
+    """The moments of the good samples that `BatchMoments` holds as an `Averaged`, in their
+    order there. `x` holds all fields of the `Averaged` of `n` samples."""
     is_used = good[:, None]
-    # Sums over no samples are zero, and so are then their means.
+    # Without samples, sums are zero, and so are means with this divisor.
     divisor = jnp.maximum(jnp.sum(good), 1)
     x = jnp.where(is_used, x, 0)
     size = jnp.max(jnp.abs(x), axis=2)
     to_unit, to_size = _scales(size)
     mean = to_size * (jnp.sum(x * to_unit[:, :, None], axis=2) / divisor)
-    # Deviations in a second pass avoid cancellation. Their own mean, which would be zero
-    # without rounding, is the correction of the mean.
+    # Deviations from the mean, in a second pass, avoid the cancellation of a difference of
+    # squares. Without rounding, their own mean would be zero: it corrects the mean.
     deviations = jnp.where(is_used, x - mean[:, :, None], 0)
     largest = jnp.max(jnp.abs(deviations), axis=2)
     deviations_to_unit, to_deviations = _scales(largest)
@@ -160,9 +162,9 @@ def _moments_of_fields(
 
 
 def _scales(size: Array) -> tuple[Array, Array]:
-    """A power of two that scales numbers of this size to about one, so that sums of them
-    and of their squares stay in range; and its inverse, to scale back. (XLA divides by
-    multiplying with the inverse, which may underflow.)"""
+    """A power of two by which numbers of this size become about one, so that sums of them
+    and of their squares stay in range; and its inverse, to scale back. (XLA would divide by
+    the power as a product with its inverse, which may underflow.)"""
     largest_exponent = jnp.finfo(size.dtype).maxexp - _SPARE_EXPONENTS
     _, exponent = jnp.frexp(size)
     exponent = jnp.clip(exponent, -largest_exponent, largest_exponent)

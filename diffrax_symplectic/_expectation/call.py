@@ -23,10 +23,10 @@ def checked_call(
     devices: Sequence[Any] | None = None,
     other_arguments: Any = (),
 ) -> tuple[PRNGKeyArray, int, Devices]:
-    """The key as a typed key, the number of the first sample, and the devices, all of them
-    in place of `None`. Raises a `ValueError` for invalid arguments, and for traced arrays
-    in `key` and in `other_arguments`. `function_name` is the function that the user called,
-    for messages."""
+    """Checks arguments, and returns the key as a typed key, the number of the first sample,
+    and the devices, which are all there are for `None`. Raises a `ValueError` for invalid
+    arguments, and for traced arrays in `key` and in `other_arguments`. `function_name` is
+    what messages call the function of the user's call."""
     key = checked_key(function_name, key, other_arguments)
     if start is not None and first != 0:
         raise ValueError(
@@ -34,7 +34,7 @@ def checked_call(
         )
     first = whole_number("first", first, 0, MOST_SAMPLES - 1)
     is_number = is_real_number(tol) and np.ndim(tol) == 0
-    # Smaller numbers have fewer digits.
+    # Numbers below `tiny` have fewer digits.
     if tol is not None and not (is_number and np.finfo(float).tiny <= tol < np.inf):
         raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")
     if start is not None and not isinstance(start, Expectation):

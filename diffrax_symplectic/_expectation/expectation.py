@@ -54,8 +54,10 @@ from .strong_friction import unresolved_friction
 
 
 # The number of levels, unless the user chooses it: the fewest that show the discretization
-# error, and with `tol` up to `_MOST_LEVELS`, the last of which has steps of `dt0 / 32`.
+# error.
 _FEWEST_LEVELS = 2
+# The number up to which levels are added to reach a `tol`. The last level has steps of
+# `dt0 / 32`.
 _MOST_LEVELS = 6
 # The advice for a quick first look. With these arguments only one program is compiled, as
 # there are no fits, no further levels and no checks of the steps.
@@ -198,24 +200,24 @@ def expectation(
     key, first, devices = checked_call(
         "expectation", key, tol, start, first, devices, other_arguments
     )
-    # An estimate with other levels cannot continue `start`.
+    # To continue `start`, an estimate must have the same levels.
     may_add_levels = levels is None and start is None
     if levels is None:
         levels = _FEWEST_LEVELS if start is None else start.levels
 
-    has_shape = any(isinstance(path, UnspecifiedPath) for path in brownian_paths(terms))
+    has_path = not any(isinstance(x, UnspecifiedPath) for x in brownian_paths(terms))
     problem_of = ft.partial(
         Problem.of, phi, terms, solver, t0, t1, dt0, y0, args, ts, key=key
     )
     times = None if ts is None else np.array(ts, float).reshape(-1)
     progress = Progress("expectation", progress_meter, _QUICK_LOOK)
-    # The looks and trials after the last sample may be interrupted, too.
+    # The checks after the last sample may be interrupted, too, and the estimate is kept.
     with ShortTraceback(), Kept() as kept, progress:
         while True:
             progress.stage("preparing the samples")
             problem, used_sampling, plan = choose(
-                ft.partial(problem_of, levels), not has_shape, key, sampling, tol,
-                start, engine, devices,
+                ft.partial(problem_of, levels), has_path, key, sampling, tol, start,
+                engine, devices,
             )  # fmt: skip
             sizes = "one step size" if levels == 1 else f"{levels} step sizes"
             progress.stage(f"compiling and sampling with {sizes}")
@@ -241,17 +243,15 @@ def expectation(
             warn_of_stragglers(
                 paths.num_stragglers, paths.num_failed, paths.num_paths, stacklevel=2
             )
-        # Warnings of the problem come with its first samples, and not again with later
-        # parts.
+        # The steps are checked with the first samples of a problem, and not again with
+        # later parts.
         if start is None and first == 0:
             messages: list[str | None] = [*messages_on_steps(problem, dt0)]
-            # A trial takes longer than these looks, which name the cause.
+            # A trial takes longer than the checks, and does not name the cause.
             if levels == 2 and not messages:
-                message, caveat = trial_with_finer_level(
-                    estimate, problem, plan, key, devices
-                )
-                messages.append(message)
-                estimate = dataclasses.replace(estimate, caveat=caveat)
+                verdict = trial_with_finer_level(estimate, problem, plan, key, devices)
+                messages.append(verdict.warning)
+                estimate = dataclasses.replace(estimate, caveat=verdict.caveat)
             if has_kinks(problem):
                 messages.append(
                     _message_on_discrete_increments(estimate, problem, key, devices)
@@ -265,16 +265,16 @@ def expectation(
 def _messages_on_result(
     estimate: Expectation, problem: Problem, tol: float | None, dt0: float
 ) -> list[str]:
-    """What is wrong with the numbers of an estimate, as sentences: failed paths, numbers
-    out of range, an error bar that may be too small, and rounding."""
-    # `num_paths` are those that did not fail.
+    """Warnings of what is wrong with the numbers of an estimate: failed paths, numbers out
+    of range, an error bar that may be too small, and rounding."""
+    # `num_paths` counts the paths that did not fail.
     most_fail = estimate.num_failed > estimate.num_paths
     lost_numbers = out_of_range(problem, most_fail)
     if lost_numbers is not None and most_fail:
         return [*cautions(estimate, tol, advice=lost_numbers)]
     advice = advice_on_failures(problem)
     is_explicit = not problem.is_implicit and constraint_of(problem.terms) is None
-    # If the first evaluation fails, too, the length of steps is not the cause.
+    # If even the first evaluation fails, the length of steps is not the cause.
     if most_fail and is_explicit and is_finite_at_start(problem):
         shorter = dt0 / max(4, unresolved_angle(problem) or 0)
         advice = (
@@ -282,25 +282,23 @@ def _messages_on_result(
             f"`{type(problem.solver).__name__}`: pass `dt0={shorter:.2g}` or less, or an "
             f"implicit solver. {advice}"
         )
-    messages = [
-        *cautions(estimate, tol, advice),
-        lost_numbers,
-        _message_on_rounding(estimate, problem),
-    ]
+    messages = [*cautions(estimate, tol, advice), lost_numbers]
+    messages.append(_message_on_rounding(estimate, problem))
     return [message for message in messages if message is not None]
 
 
 def messages_on_steps(problem: Problem, dt0: float) -> list[str]:
-    """What is wrong with the steps, which the error of the estimate may not show."""
+    """Warnings of what is wrong with the steps, where the error of the estimate may not
+    show it."""
     levels = len(problem.levels.h)
-    # With one level the result does not claim to include the discretization error.
+    # With one level, the error does not claim to include the discretization error.
     if levels == 1:
         return []
     found = [
         jumps_within_steps(problem) or unresolved_drive(problem),
         too_long_steps(problem, dt0),
     ]
-    # With three levels the order is checked, which shows the following.
+    # With three levels the order is checked, which shows the errors of these checks.
     if levels == 2:
         found += [
             unresolved_noise(problem, dt0),
@@ -313,9 +311,9 @@ def messages_on_steps(problem: Problem, dt0: float) -> list[str]:
 def _message_on_discrete_increments(
     estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: Devices
 ) -> str | None:
-    """What is wrong with the mean of a `phi` that may not be smooth if increments are
-    discrete, as a sentence; `None` if nothing is. A trial with Gaussian increments shows
-    it, or without a trial, that the solver takes discrete increments only."""
+    """A warning that discrete increments give a wrong mean of a `phi` that may not be
+    smooth; `None` if increments are not discrete, or a trial with Gaussian increments has
+    the same mean. For solvers that take discrete increments only, there is no trial."""
     paths = random_paths(problem.terms)
     laws = [law for path in paths for law in (laws_of(path) or {}).values()]
     if not any(isinstance(law, Discrete) for law in laws):
@@ -326,7 +324,7 @@ def _message_on_discrete_increments(
             "increments alone, which have the right means of smooth functions only. Pass "
             'a solver of `suggest_solver(terms, t0, y0, args, want="strong")`.'
         )
-    # Paths that are one Brownian motion become one again.
+    # Paths of the same Brownian motion get Gaussian paths of the same one.
     gaussian_path = ft.partial(own_path, problem.solver, "strong")
     terms = with_paths(gaussian_path, motion_numbers(paths), problem.terms, key)
     gaussian_problem = dataclasses.replace(problem, terms=terms)
@@ -350,15 +348,15 @@ def _message_on_discrete_increments(
 
 
 def _message_on_rounding(estimate: Expectation, problem: Problem) -> str | None:
-    """What to do if rounding in single precision may exceed the sampling error, as
-    sentences; `None` if it does not."""
+    """A warning that rounding in single precision may exceed the sampling error; `None` if
+    it does not."""
     precision = np.finfo(problem.dtype)
     if precision.bits >= 64:
         return None
-    # The rounding errors of a step size have the same sign in all steps, so they add up.
+    # The rounding error of a step size is the same in all steps, so these errors add up.
     fraction = float(precision.eps) * problem.finest_steps
-    # No estimate reports a standard error below this (see `rounding_floor`). Up to twice
-    # the floor, rounding may be most of it.
+    # No estimate reports a standard error below this floor (see `rounding_floor`). Rounding
+    # may be most of a standard error up to twice the floor.
     floor = fraction * np.abs(estimate.vectors.mean)
     if not np.any(estimate.vectors.std_error <= 2 * floor):
         return None

@@ -19,54 +19,47 @@ from .fields_in_time import (
 )
 
 
-# The most times that are looked at, spread over the interval: a pulse is seen if it is
-# longer than the time between them. For large systems there are fewer, so that at most
-# `_MOST_NUMBERS` are computed, which takes some tenths of a second.
+# The most times that are looked at, spread over the interval. A pulse is seen if it is
+# longer than the time between two of them.
 _MOST_TIMES = 2**16
+# The most numbers that are computed, which takes some tenths of a second: of large systems
+# fewer times are looked at.
 _MOST_NUMBERS = 2**22
-# Whatever the size of the system, at least so many times in each step that is looked at,
-# and so many steps (or all, if there are fewer).
+# Whatever the size of the system, at least this many times are looked at in a step, and at
+# least this many steps, or all if there are fewer.
 _FEWEST_TIMES_IN_STEP = 16
 _FEWEST_STEPS = 2**6
-# Steps do not resolve a field that departs from a straight line over each step by more than
-# this multiple of its departure from its mean, in the root mean square. A drive of angular
-# frequency Omega reaches this at Omega h = 3.5 to 4.1, with many and with 16 times in a
-# step.
+# Over each step, a field departs from a straight line, and from its mean over the step.
+# Steps do not resolve the field if the first departure is more than this multiple of the
+# second, in the root mean square. A drive of angular frequency Omega reaches this multiple
+# at Omega h = 3.4 with many times in a step, and at 4.2 with 16 times.
 # Measured on a damped oscillator that is driven at random phases, by `BAOAB` and the
-# midpoint rule: up to 4, for the shorter of two steps, one mean in twenty is more than two
-# error bars off; beyond, up to nineteen in twenty, by a thousand bars and more.
+# midpoint rule: if Omega h is up to 4, for the shorter of two steps, one mean in twenty is
+# more than two error bars off. Beyond, up to nineteen in twenty are, by a thousand bars and
+# more.
 _MOST_DEPARTURE = 1.0
 # Changes of less than this fraction of a field are too small to matter.
 _SMALL_CHANGE = 1e-3
 
 
 def unresolved_drive(problem: Problem) -> str | None:
-    """What is wrong with forces or noise that change in time many times in a step, as a
-    sentence; `None` if they do not.
+    """A warning if forces or noise change in time so fast that steps do not resolve them;
+    `None` if steps do.
 
-    If all steps are multiples of a period, no level sees that anything changes."""
-    # With `args` of its own, each path may have changes at other times. A step that misses
-    # those of one path meets those of another, so levels do not agree on a wrong mean.
+    Levels then need not show an error. For example, if all steps are multiples of a period,
+    no level sees any change."""
+    # If each path draws its own `args`, changes come at other times on each path. A step
+    # misses the changes of some paths and not of others, so levels do not agree on a wrong
+    # mean.
     if problem.args_of is not None:
         return None
     field = all_fields(problem)
     if not depends_on_time(field, problem.t0, problem.y0):
         return None
-    h = float(problem.levels.h[-1])
-    most_times = min(_MOST_TIMES, _MOST_NUMBERS // max(problem.num_components, 1))
-    most_steps = max(_FEWEST_STEPS, most_times // _FEWEST_TIMES_IN_STEP)
-    step_numbers = np.arange(problem.finest_steps)
-    if len(step_numbers) > most_steps:
-        spread = spread_evenly(most_steps) * problem.finest_steps
-        step_numbers = np.unique(np.floor(spread))
-    times_in_step = max(_FEWEST_TIMES_IN_STEP, most_times // len(step_numbers))
-    # The first point is the start of a step, where a jump would belong to the step before.
-    fractions = np.sort(spread_evenly(times_in_step + 1)[1:])
-    # (steps, times)
-    times = float(problem.t0) + h * (step_numbers[:, None] + fractions)
-    departure = _departure(field, problem.y0, times.astype(problem.dtype))
+    departure = _departure(field, problem.y0, _times_in_steps(problem))
     if not float(departure) > _MOST_DEPARTURE:
         return None
+    h = float(problem.levels.h[-1])
     return (
         f"The forces or the noise change in time too fast for steps of {h:.3g}, the "
         "shortest of all levels. Where a pulse is shorter than a step, or a step is a "
@@ -75,13 +68,32 @@ def unresolved_drive(problem: Problem) -> str | None:
     )
 
 
+def _times_in_steps(problem: Problem) -> Float[np.ndarray, "steps times"]:
+    """The times to look at: many in each of the shortest steps, or in some of these steps
+    from all over the interval."""
+    most_times = min(_MOST_TIMES, _MOST_NUMBERS // max(problem.num_components, 1))
+    most_steps = max(_FEWEST_STEPS, most_times // _FEWEST_TIMES_IN_STEP)
+    step_numbers = np.arange(problem.finest_steps)
+    if len(step_numbers) > most_steps:
+        spread = spread_evenly(most_steps) * problem.finest_steps
+        step_numbers = np.unique(np.floor(spread))
+    times_in_step = max(_FEWEST_TIMES_IN_STEP, most_times // len(step_numbers))
+    # Times within a step, as fractions of it. The first point, which is the start of the
+    # step, is left out: a jump there would belong to the step before.
+    fractions = np.sort(spread_evenly(times_in_step + 1)[1:])
+    in_steps = step_numbers[:, None] + fractions
+    times = float(problem.t0) + float(problem.levels.h[-1]) * in_steps
+    return times.astype(problem.dtype)
+
+
 @ft.partial(compiled, quickly=True)
 def _departure(
     field: Field, y0: Y, times: Float[Array, "steps times"]
 ) -> Float[Array, ""]:
-    """The root mean square, over all steps, by which a field departs from the straight line
-    between its values at the first and the last time of a step, divided by that by which it
-    departs from its mean over the step; zero if it changes little."""
+    """The departure of a field from a straight line over each step, divided by its
+    departure from its mean over the step, both in the root mean square over all steps; zero
+    if the field changes little. The line joins the values at the first and the last of the
+    `times` in a step."""
     values_at = at_both_states(field, y0)
 
     def squares(times: Float[Array, " times"]) -> Float[Array, "3"]:

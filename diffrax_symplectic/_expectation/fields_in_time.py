@@ -24,8 +24,8 @@ from .._terms import (
 from .linear_maps import arbitrary_direction
 
 
-# The fractional parts of its multiples fill the interval from 0 to 1 evenly, and fall into
-# step with no period.
+# The fractional parts of the multiples of this number fill the interval from 0 to 1 evenly,
+# without a period that might be that of a drive.
 _GOLDEN_RATIO = (1 + 5**0.5) / 2
 
 # A vector field at a time and a state: a `jax.tree_util.Partial` of one of the functions
@@ -45,14 +45,14 @@ def forces(drift: Terms, args: Args, t: Array, y: Y) -> Float[Array, " n"]:
 
 
 def noise_change(noise: Terms, args: Args, t: Array, y: Y) -> Float[Array, " n"]:
-    """The change of the state by noise, for arbitrary increments of size one."""
+    """The change of the state by noise, for arbitrary increments of about size one."""
     zeros, unravel = zeros_and_unravel([control_struct(term, t) for term in noise])
     controls = unravel(arbitrary_direction(zeros.size, zeros.dtype))
     return jfu.ravel_pytree(apply(noise, controls, args, t, y))[0]
 
 
 def all_fields(problem: Problem) -> Field:
-    """The rate of the drift with its friction, and the change by noise."""
+    """The rate of the drift with its friction, and the change by noise, as one field."""
     drift, noise = split_terms(without_constraint(problem.terms))
     return jtu.Partial(_all_fields, drift, noise, problem.args)
 
@@ -70,8 +70,8 @@ def _all_fields(
 
 @once_for_each_signature
 def depends_on_time(field: Field, t0: Float[Array | np.ndarray, ""], y0: Y) -> bool:
-    """Whether a field depends on time: whether its program reads the time. (Its values at
-    several times might be equal by chance.)"""
+    """Whether a field depends on time, by whether its program reads the time. (Its values
+    at several times might be equal by chance.)"""
     dependence = Dependence(lambda t: field(t, y0), t0)
     return not dependence.independent(lambda t: t)
 
@@ -79,10 +79,10 @@ def depends_on_time(field: Field, t0: Float[Array | np.ndarray, ""], y0: Y) -> b
 def at_both_states(
     field: Field, y0: Y
 ) -> Callable[[Float[Array, " times"]], Float[Array, "times n"]]:
-    """The function from times to the field at two states, as one vector for each time: at
-    `y0`, and at an arbitrary state about as far from `y0` as `y0` is from zero. (At `y0`
-    alone a change may not show: in a trap that is stiffened, the force on a particle at its
-    centre is always zero.)"""
+    """A function of times that returns the values of the field at two states, as one vector
+    for each time. The states are `y0`, and an arbitrary state about as far from `y0` as
+    `y0` is from zero. (At `y0` alone a change may not show: in a trap that is stiffened,
+    the force on a particle at its centre is always zero.)"""
 
     def with_moved(x: PyTree[Array]) -> Array:
         x = jnp.asarray(x)
@@ -100,5 +100,5 @@ def at_both_states(
 
 
 def spread_evenly(number: int) -> Float[np.ndarray, " number"]:
-    """So many points from 0 to 1, the first of which is 0. They are not in order."""
+    """This many points, spread evenly from 0 to 1, in no order. The first is 0."""
     return np.arange(number) * _GOLDEN_RATIO % 1

@@ -1,4 +1,10 @@
-"""A trial with one more level, where two levels cannot check themselves."""
+"""A trial with one more level, for estimates of two levels.
+
+Two levels agree on a wrong mean where both miss what happens in shorter times than a step,
+such as a rotation, a close encounter or a decay. Where phases are lost, they may agree by
+chance. The trial shows whether a third level, with steps half as long as the finest ones,
+would change the mean by more than its error.
+"""
 
 import dataclasses
 import functools as ft
@@ -33,16 +39,17 @@ from .run import run
 from .sampling import SamplingPlan
 
 
-# The paths of a trial on the same noise: a larger number is tried only if, with the one
-# before, statistical noise hides changes as large as the error.
+# The numbers of independent paths that are tried. A larger number is tried only if, with
+# the one before, statistical noise hides changes as large as the error.
 _PATHS_OF_TRIALS = 512, 2048, 8192
-# A trial takes at most this share of the samples of the estimate: the first one, and any
-# that follows. Where the estimate takes 3 steps (1 and 2, on two levels), a path of the
-# trial takes 7 on the same noise (1, 2 and 4), or 6 with halved steps on both levels.
+# The first trial takes at most this share of the samples of the estimate. (Where a path of
+# the estimate takes 3 steps, 1 and 2 on two levels, a path of the trial takes 7 on three
+# levels, or 6 with halved steps on two levels.)
 _SHARE_OF_FIRST_TRIAL = 1 / 8
+# Each later trial takes at most this share.
 _SHARE_OF_LATER_TRIALS = 1 / 32
-# The standard error of fewer paths than this is itself too uncertain. An estimate whose
-# share is less than this has no trial, since one of 32 paths would be a large part of it.
+# The standard error of fewer paths than this is itself too uncertain. If this number is
+# more than the share of the first trial, there is no trial.
 _FEWEST_PATHS = 32
 # The change of a single mean is sure if it is this many standard errors from zero, which
 # happens by chance once in 370 times. (`_Changes.visible` asks for more of many means.)
@@ -51,29 +58,39 @@ _STD_ERRORS_TO_BE_SURE = 3
 _LARGEST_SHARE_FAILED = 0.1
 
 
+class Verdict(NamedTuple):
+    """What a trial says of an estimate.
+
+    - `warning`: what is wrong with the steps, in sentences; `None` if the trial shows
+        nothing wrong.
+    - `caveat`: which changes the trial could not see, in words; empty if it could see a
+        change as large as the error.
+    """
+
+    warning: str | None = None
+    caveat: str = ""
+
+
 def trial_with_finer_level(
     estimate: Expectation,
     problem: Problem,
     plan: SamplingPlan,
     key: PRNGKeyArray,
     devices: Devices,
-) -> tuple[str | None, str]:
-    """How a finer level changes an estimate of two levels by more than its error, as a
-    sentence (`None` if it does not); and which changes the trial could not see, in words
-    (empty if these are less than the error).
+) -> Verdict:
+    """Tries whether a finer level changes an estimate of two levels by more than its error.
+    There are two kinds of trials:
 
-    Two levels agree on a wrong mean where both miss what happens in shorter times, such as
-    a rotation, a close encounter or a decay, and by chance where phases are lost.
-
-    There are two kinds of trials. One takes independent paths, with the same noise on all
-    levels if the solver allows it, so that their differences vary little. Even so, the
-    standard error of a difference may be a hundred times the error of an estimate by value
-    functions or sorted paths. So these are sampled again with halved steps, by the
-    programs that are compiled already: a change of ten errors is then visible. (Sorted
-    paths whose steps may miss a rotation get the first kind all the same, since a change of
-    less than ten errors would remain possible.)"""
+    - On independent paths, if possible with the same noise on all levels, so that the
+        difference between levels varies little. Even so, its standard error may be a
+        hundred times the error of an estimate by value functions or sorted paths.
+    - For value functions and sorted paths: by the same sampling with halved steps, whose
+        programs are compiled already. A change of ten errors is then visible. A smaller
+        change remains possible, so sorted paths whose steps may miss a rotation get a trial
+        of the first kind."""
+    # Of paths with an unknown law nothing is known on a finer level.
     if any(map(has_unknown_law, brownian_paths(problem.terms))):
-        return None, ""
+        return Verdict()
     key = trial_key(key)
     is_fitted = isinstance(estimate.sampling, ValueFunctions)
     angle = unresolved_angle(problem)
@@ -82,39 +99,15 @@ def trial_with_finer_level(
     else:
         changes = _changes_on_same_noise(estimate, problem, key, devices)
     if changes is None:
-        return None, ""
-    h = problem.levels.h
-    advice = "Pass a smaller `dt0`, or `levels=3`, which checks the order."
-    if changes.are_sure:
-        worst = int(np.argmax(changes.excess))
-        message = (
-            f"Steps are too long: on {changes.num_paths} paths of a trial, a third level, "
-            f"with steps of {float(h[-1]) / 2:.3g}, changes a mean"
-            f"{label_of(estimate, worst)} by {changes.sizes[worst]:.2g} ± "
-            f"{changes.std_errors[worst]:.1g}, which is more than its error, "
-            f"{changes.errors[worst]:.1g}. {advice}"
-        )
-        return message, ""
-    # Next to value functions the standard error of fewer samples is always the larger one,
-    # which says little of resolved steps.
-    if is_fitted or not changes.are_hidden:
-        return None, ""
-    caveat = _caveat(estimate, changes)
-    if angle is None:
-        return None, caveat
-    message = (
-        f"Steps of `dt0={float(h[0]):g}` are long, omega h = {angle:.3g} for the largest "
-        "frequency of the drift where paths start, and two levels may agree on a wrong "
-        f"mean by chance: {caveat}, which is more than the error. {advice}"
-    )
-    return message, ""
+        return Verdict()
+    return _verdict(estimate, problem, changes, angle)
 
 
 class _Changes(NamedTuple):
-    """The changes of all means by a finer level.
+    """By how much a finer level changes each number of the mean, as a trial shows.
 
-    - `sizes`, `std_errors`: their absolute values and standard errors.
-    - `errors`: the errors of the means, as the estimate states them.
+    - `sizes`, `std_errors`: the absolute values of the changes, and their standard errors.
+    - `errors`: the errors of the mean, as the estimate states them.
     - `num_paths`: the number of paths of the trial.
     """
 
@@ -125,31 +118,63 @@ class _Changes(NamedTuple):
 
     @property
     def visible(self) -> Float[np.ndarray, " n"]:
-        """The smallest changes that are surely not by chance."""
+        """The smallest changes that chance alone would surely not make."""
         # The largest of n normal numbers grows like the square root of 2 log(n).
-        num_std_errors = np.sqrt(
-            _STD_ERRORS_TO_BE_SURE**2 + 2 * np.log(self.sizes.size)
-        )
-        return num_std_errors * self.std_errors
+        log_n = np.log(self.sizes.size)
+        return np.sqrt(_STD_ERRORS_TO_BE_SURE**2 + 2 * log_n) * self.std_errors
 
     @property
     def excess(self) -> Float[np.ndarray, " n"]:
-        """By how much the changes surely exceed the errors; negative if they do not."""
+        """By how much the changes surely exceed the errors. Negative where they may not
+        exceed them."""
         # A change that is NaN must not be the largest, for `np.any` and `np.argmax`.
         return np.nan_to_num(self.sizes - self.visible - self.errors, nan=-np.inf)
 
     @property
     def are_sure(self) -> bool:
-        """Whether a change is surely more than an error."""
+        """Whether any change surely exceeds its error."""
         return bool(np.any(self.excess > 0))
 
     @property
     def are_hidden(self) -> bool:
-        """Whether the noise would hide a change as large as an error."""
+        """Whether the noise of the trial would hide a change as large as an error."""
         return bool(np.any(self.visible > self.errors))
 
 
+def _verdict(
+    estimate: Expectation, problem: Problem, changes: _Changes, angle: float | None
+) -> Verdict:
+    """What the changes say of an estimate. `angle` is that of `unresolved_angle`."""
+    advice = "Pass a smaller `dt0`, or `levels=3`, which checks the order."
+    if changes.are_sure:
+        worst = int(np.argmax(changes.excess))
+        finer_step = float(problem.levels.h[-1]) / 2
+        return Verdict(
+            warning=f"Steps are too long: on {changes.num_paths} paths of a trial, a third "
+            f"level, with steps of {finer_step:.3g}, changes a mean"
+            f"{label_of(estimate, worst)} by {changes.sizes[worst]:.2g} ± "
+            f"{changes.std_errors[worst]:.1g}, which is more than its error, "
+            f"{changes.errors[worst]:.1g}. {advice}"
+        )
+    # Beside the errors of value functions, the noise of the trial is always large. A caveat
+    # would say little of steps that are resolved.
+    is_fitted = isinstance(estimate.sampling, ValueFunctions)
+    if is_fitted or not changes.are_hidden:
+        return Verdict()
+    caveat = _caveat(estimate, changes)
+    if angle is None:
+        return Verdict(caveat=caveat)
+    # Steps may miss a rotation, and the trial is too noisy to tell.
+    return Verdict(
+        warning=f"Steps of `dt0={float(problem.levels.h[0]):g}` are long, omega h = "
+        f"{angle:.3g} for the largest frequency of the drift where paths start, and two "
+        f"levels may agree on a wrong mean by chance: {caveat}, which is more than the "
+        f"error. {advice}"
+    )
+
+
 def _caveat(estimate: Expectation, changes: _Changes) -> str:
+    """Which changes the trial could not see, in words."""
     worst = int(np.argmax(changes.visible / changes.errors))
     return (
         f"a trial with halved steps, on {changes.num_paths:,} paths, could only see a "
@@ -160,30 +185,23 @@ def _caveat(estimate: Expectation, changes: _Changes) -> str:
 def _changes_on_same_noise(
     estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: Devices
 ) -> _Changes | None:
-    """The changes on independent paths, more and more of them until the changes are sure,
-    or known well enough to be less than the errors. `None` if the estimate has too few
-    paths for a trial, or too many paths of the trial fail."""
-    first, *others = _PATHS_OF_TRIALS
-    # All trials take as many paths at once as the first one, so that they share a program;
-    # or fewer if the user chose a smaller batch, as to save memory.
-    batch_size = first
+    """The changes by a third level, on independent paths with the same noise on all levels
+    if possible. More and more paths are taken until the changes are sure, or the noise does
+    not hide changes as large as the errors. `None` if the estimate has too few paths for a
+    trial, or if too many paths of the trial fail."""
+    # All trials take batches of the same size, so that they share a program. The user may
+    # have chosen a smaller size, for example to save memory.
+    batch_size = _PATHS_OF_TRIALS[0]
     sampling = estimate.sampling
     if isinstance(sampling, IndependentPaths) and sampling.batch_size is not None:
-        batch_size = min(first, int(sampling.batch_size))
-    # A fit takes far longer than the largest trial.
-    if not isinstance(sampling, ValueFunctions):
-        first = min(first, int(_SHARE_OF_FIRST_TRIAL * estimate.num_paths))
-        most = _SHARE_OF_LATER_TRIALS * estimate.num_paths
-        others = [num_paths for num_paths in others if num_paths <= most]
-    if first < _FEWEST_PATHS:
-        return None
+        batch_size = min(batch_size, int(sampling.batch_size))
     finer_problem = _with_finer_level(problem, key)
     trial = None
     changes = None
-    for num_paths in (first, *others):
-        plan = IndependentPaths(num_paths, batch_size).prepare(
-            finer_problem, key, devices
-        )
+    for num_paths in _numbers_of_paths(estimate):
+        sampling_of_trial = IndependentPaths(num_paths, batch_size)
+        plan = sampling_of_trial.prepare(finer_problem, key, devices)
+        # Each trial continues the one before.
         trial = run(plan._replace(is_quick=True), key, devices, start=trial)
         if trial.num_failed > _LARGEST_SHARE_FAILED * num_paths:
             return None
@@ -200,51 +218,35 @@ def _changes_on_same_noise(
     return changes
 
 
-def _changes_by_same_sampling(
-    estimate: Expectation, plan: SamplingPlan, key: PRNGKeyArray, devices: Devices
-) -> _Changes | None:
-    """The changes on samples of the same kind with halved steps; `None` if too many
-    fail."""
-    assert plan.with_halved_steps is not None
-    # At least two samples, for a standard error; and a whole batch, since a part of one
-    # takes as long.
-    num_samples = max(
-        2, plan.batch_size, int(_SHARE_OF_FIRST_TRIAL * estimate.num_samples)
-    )
-    trial_plan = plan.with_halved_steps()._replace(
-        num_samples=num_samples, is_quick=plan.is_quick
-    )
-    trial = run(trial_plan, key, devices)
-    if trial.num_failed > _LARGEST_SHARE_FAILED * num_samples * plan.paths_per_sample:
-        return None
-    of_estimate = estimate.vectors
-    of_trial = trial.vectors
-    # The standard error of so few samples may come out far too small. It is taken to be at
-    # least what the spread of the estimate's samples gives for this number of them.
-    least = of_estimate.std_error * np.sqrt(estimate.num_samples / num_samples)
-    trial_std_error = np.maximum(least, of_trial.std_error)
-    return _Changes(
-        sizes=np.abs(of_trial.mean - of_estimate.mean),
-        std_errors=np.hypot(of_estimate.std_error, trial_std_error),
-        errors=of_estimate.error,
-        num_paths=trial.num_paths,
-    )
+def _numbers_of_paths(estimate: Expectation) -> list[int]:
+    """The numbers of paths of trials on independent paths, in increasing order. The list is
+    empty if the estimate has too few paths for a trial."""
+    # A fit takes far longer than the largest trial.
+    if isinstance(estimate.sampling, ValueFunctions):
+        return [*_PATHS_OF_TRIALS]
+    first, *later = _PATHS_OF_TRIALS
+    first = min(first, int(_SHARE_OF_FIRST_TRIAL * estimate.num_paths))
+    if first < _FEWEST_PATHS:
+        return []
+    most_later = _SHARE_OF_LATER_TRIALS * estimate.num_paths
+    return [first, *(num_paths for num_paths in later if num_paths <= most_later)]
 
 
 def _with_finer_level(problem: Problem, key: PRNGKeyArray) -> Problem:
-    """The problem with one more level. Its single combination of levels is the change of
-    the mean if the coarsest level is left out for the new one."""
+    """The problem with one more level, whose steps are half as long as the finest ones. Its
+    single combination of levels is a difference of two extrapolated means: from all levels
+    but the coarsest, minus from all but the new one."""
     levels = with_next_level(problem.levels)
-    finest = levels.h[-1]
+    finest_step = levels.h[-1]
     terms = problem.terms
-    # Paths that draw an increment for each cell, one finest step long, have the same noise
-    # on all levels. Cells begin at multiples of their length, where steps must begin, too,
-    # and their increments are Gaussian, which the solver must take. Otherwise the levels
-    # have independent noise.
-    begins_at_cell = is_multiple(float(problem.t0), float(finest))
+    # Paths with a `cell` have the same noise on all levels: they draw a Gaussian increment
+    # from each multiple of the cell to the next, and add the increments up over a step.
+    # This needs steps that begin at multiples of the cell, and a solver that takes Gaussian
+    # increments. Otherwise the noise of the levels is independent.
+    begins_at_cell = is_multiple(float(problem.t0), float(finest_step))
     if begins_at_cell and not has_discrete_increments(problem.solver):
-        # An array, so that another cell compiles nothing anew.
-        path = ft.partial(common_path, problem.solver, np.asarray(finest))
+        # The cell is an array, since another number would compile anew.
+        path = ft.partial(common_path, problem.solver, np.asarray(finest_step))
         numbers = motion_numbers(random_paths(terms))
         terms = with_paths(path, numbers, terms, key)
     weights = finer_change_weights(problem.order, len(problem.levels.h))
@@ -253,4 +255,34 @@ def _with_finer_level(problem: Problem, key: PRNGKeyArray) -> Problem:
         terms=terms,
         levels=levels,
         weights=weights[None].astype(problem.weights.dtype),
+    )
+
+
+def _changes_by_same_sampling(
+    estimate: Expectation, plan: SamplingPlan, key: PRNGKeyArray, devices: Devices
+) -> _Changes | None:
+    """The changes by halved steps on both levels, on samples of the same kind as those of
+    the estimate. `None` if too many paths of the trial fail."""
+    assert plan.with_halved_steps is not None
+    # At least two samples, for a standard error; and at least a whole batch, since a part
+    # of one takes as long.
+    share = int(_SHARE_OF_FIRST_TRIAL * estimate.num_samples)
+    num_samples = max(2, plan.batch_size, share)
+    trial_plan = plan.with_halved_steps()._replace(
+        num_samples=num_samples, is_quick=plan.is_quick
+    )
+    trial = run(trial_plan, key, devices)
+    if trial.num_failed > _LARGEST_SHARE_FAILED * num_samples * plan.paths_per_sample:
+        return None
+    of_estimate = estimate.vectors
+    of_trial = trial.vectors
+    # The standard error of so few samples may come out far too small. So it is taken to be
+    # at least that of as many samples of the estimate.
+    least = of_estimate.std_error * np.sqrt(estimate.num_samples / num_samples)
+    trial_std_error = np.maximum(least, of_trial.std_error)
+    return _Changes(
+        sizes=np.abs(of_trial.mean - of_estimate.mean),
+        std_errors=np.hypot(of_estimate.std_error, trial_std_error),
+        errors=of_estimate.error,
+        num_paths=trial.num_paths,
     )

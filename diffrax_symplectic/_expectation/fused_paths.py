@@ -15,8 +15,8 @@ from .independent import IndependentPaths, samples_of_paths
 from .sampling import Outputs, Samples, SamplingPlan
 
 
-# The default number of paths in a batch: many, since each call of the kernel takes a while
-# before its first path.
+# The default number of paths in a batch. It is large, since each call of the kernel takes a
+# while before its first path.
 _FUSED_BATCH = 2**19
 
 
@@ -24,7 +24,8 @@ def fused_plan(
     problem: Problem, key: PRNGKeyArray, sampling: Any, devices: Devices
 ) -> SamplingPlan:
     r"""A plan by which a kernel simulates independent paths, and JAX evaluates $\phi$.
-    Raises a `ValueError` for another `sampling`, or several devices."""
+    Raises a `ValueError` unless `sampling` is an `IndependentPaths`, and for several
+    devices."""
     if not isinstance(sampling, IndependentPaths):
         raise ValueError(
             '`engine="drjit"` takes independent paths: pass '
@@ -49,9 +50,9 @@ def fused_plan(
 class FusedPaths:
     """Simulates the paths of a plan by a fused kernel, and counts them.
 
-    - `num_paths`: the number of paths so far, on all levels.
-    - `num_failed`: how many of these failed.
-    - `num_stragglers`: how many of these the kernel handed back to JAX.
+    - `num_paths`: the number of paths so far, on all levels together.
+    - `num_failed`: how many of these paths failed.
+    - `num_stragglers`: how many of these paths the kernel handed back to JAX.
     """
 
     def __init__(self, problem: Problem, key: PRNGKeyArray):
@@ -63,9 +64,9 @@ class FusedPaths:
         self.num_stragglers = 0
 
     def __call__(self, first: int, num_samples: int) -> tuple[PyTree, np.ndarray]:
-        """The paths of this number of samples, from sample number `first` on: their states
-        at the saved times, with axes for levels, paths and times, and which paths failed,
-        with axes for levels and paths."""
+        """Simulates the paths of this number of samples, from sample number `first` on.
+        Returns their states at the saved times, with axes for levels, paths and times; and
+        which paths failed, with axes for levels and paths."""
         sample_numbers = np.arange(first, first + num_samples, dtype=np.uint64)
         batches = [
             by_drjit(self._problem, self._key, sample_numbers, level)
@@ -83,18 +84,18 @@ def _samples_of_fused_paths(
     paths: tuple[PyTree[Array], Bool[Array, "levels n"]],
     keys: Key[Array, " n"],
 ) -> Samples:
-    """The samples of paths that a kernel has simulated, as `FusedPaths` returns them. From
-    the key of a path its `args` are drawn once more.
+    """The samples of `paths` that `FusedPaths` returned. The `args` of each path are drawn
+    from its key once more.
 
     Axes are named as in `_simulation/problem.py`: `S` times, and `m` numbers of `phi` at
-    each."""
+    each time."""
     states, failed = paths
     _, args_of_paths = jax.vmap(problem.draw_start)(keys)
 
-    # `y` holds the states of a path at all times.
     def values_of_path(
         times: Any, y: PyTree[Array], own_args: PyTree[Array]
     ) -> Float[Array, "S m"]:
+        """The values of `phi` on a path with the states `y` at all times."""
         return jax.vmap(problem.with_args(own_args).values)(times, y)
 
     def values_on_level(level: Level, y: PyTree[Array]) -> Float[Array, "n S m"]:

@@ -21,8 +21,8 @@ from .sampling import (
 )
 
 
-# The default sizes of a batch. On CPUs it keeps all cores busy and fits their caches;
-# elsewhere more paths at once are needed to be busy.
+# The default sizes of a batch. On CPUs this size keeps all cores busy and fits their
+# caches. Elsewhere it takes more paths at once to keep a device busy.
 _BATCH_ON_CPU = 2**15
 _BATCH_ELSEWHERE = 2**18
 
@@ -63,7 +63,7 @@ class IndependentPaths(AbstractSampling):
         devices: Devices,
         bytes_of_path: int,
     ) -> SamplingPlan:
-        """The plan for a `sampler`, any function that makes a sample for each key.
+        """The plan for any `sampler`, a function that makes a sample for each key.
         `bytes_of_path` is the least memory that a path takes."""
         if self.batch_size is None:
             size = _BATCH_ON_CPU if devices[0].platform == "cpu" else _BATCH_ELSEWHERE
@@ -87,7 +87,8 @@ def samples_of_paths(
     values: Float[Array, "levels n numbers"],
     failed: Bool[Array, "levels n"],
 ) -> Samples:
-    """The samples of independent paths: combinations of their values on all levels, with
-    these weights, and which of them failed."""
+    """The samples of independent paths, from the values of the paths on all levels, and
+    which of the paths failed. Each sample is combined from the levels with these weights.
+    """
     averaged = Averaged(combinations(weights, values))
     return Samples(averaged, good=~jnp.any(failed, axis=0), num_failed=failed)

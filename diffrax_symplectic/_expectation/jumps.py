@@ -1,4 +1,8 @@
-"""Whether forces or noise jump in time, where two levels do not show what that does."""
+"""Whether forces or noise jump in time in a way that two levels do not show.
+
+A field here is a vector field of the problem, as a function of time and state. Jumps are
+found by its values at many times.
+"""
 
 import functools as ft
 from typing import NamedTuple
@@ -36,42 +40,44 @@ from .fields_in_time import (
 )
 
 
-# How far on either side of the end of a step forces are compared, in units in the last
-# place of the largest time: the user's time of a jump and that of a step are rounded.
+# The values just before and just after a time are taken at this distance from it, in units
+# in the last place of the largest time. (The time at which a function of the user jumps is
+# rounded, as is the end of a step.)
 _ROUNDINGS = 16
-# The fraction of a step over which the change of a smooth force is measured.
+# The fraction of a step over which the change of a smooth field is measured.
 _SMOOTH_FRACTION = 1e-3
-# A change that is more than so many times this one is a jump.
+# A field jumps if it changes by more than this many times the change of a smooth field.
 _JUMP_PER_SMOOTH_CHANGE = 4
-# The most steps that are looked at, the first ones, and how many at once.
+# At most this many steps are looked at, the first ones, and this many of them at once.
 _MOST_STEPS = 2**14
 _STEPS_AT_ONCE = 256
-# A jump is searched for in this many steps at most, those with the largest changes. Over a
-# whole step a smooth change may be larger than the jump, so the step is divided into this
-# many parts first, and only the part that changes most is bisected.
+# At most this many steps are searched for a jump, those over which the field changes most.
 _MOST_STEPS_SEARCHED = 256
+# A step that is searched is divided into this many parts, and the part that changes most is
+# bisected. (Over a whole step, a smooth change may be larger than the jump.)
 _PARTS_OF_STEP = 32
 
 
 def jumps_within_steps(problem: Problem) -> str | None:
-    """What is wrong with forces or noise that jump in time between the ends of the shortest
-    steps, as a sentence; `None` if none do.
+    """A warning if forces or noise jump in time within one of the shortest steps, away from
+    its ends; `None` if they do not.
 
-    Any solver then makes an error of first order. As long as all levels take the jump at
-    the same end of a step, this error is the same on all of them, so that they agree. A
-    jump whose time is random, with another one for each path, does not count: the errors
-    of the paths average out."""
+    Any solver makes an error of first order at such a jump, as if the jump were at an end
+    of the step. If this is the same time on all levels, so is the error, and they agree on
+    a wrong mean. A jump at a random time, which differs between paths, does not count,
+    since the errors of the paths average out."""
     if not depends_on_time(all_fields(problem), problem.t0, problem.y0):
         return None
     steps = _steps_to_look_at(problem)
     if steps is None:
         return None
     times = _times_of_jumps(problem, steps)
-    # Only jumps that another draw of `args` has, too, are at the same time on all paths.
+    # If each path draws its own `args`, only jumps that a second draw has at the same times
+    # count.
     if problem.args_of is not None and times.size:
         _, other_args = problem.draw_start(jr.key(2))
         other_times = _times_of_jumps(problem.with_args(other_args), steps)
-        # (jumps of one draw, jumps of the other)
+        # (jumps of the first draw, jumps of the second)
         are_equal = np.abs(times[:, None] - other_times) < steps.far
         times = times[np.any(are_equal, axis=1)]
     if not times.size:
@@ -84,84 +90,101 @@ def jumps_within_steps(problem: Problem) -> str | None:
 
 
 def jumps_at_step_ends(problem: Problem) -> str | None:
-    """What is wrong with forces or noise that jump at the end of a step, as a sentence;
-    `None` if none do, or for solvers that do not evaluate them there, or are of order 1
-    anyway, by which two levels extrapolate.
+    """A warning if forces or noise jump in time at the end of a step, and the solver
+    evaluates them there; `None` otherwise.
 
-    Such a field has one value at the time of the jump, which the step that ends there and
-    the one that begins there both take: for one of them it is that of the wrong side. So
-    the mean converges with order 1. But two levels extrapolate by order 2, and find less
-    than the error. The ends of the shortest steps include the middles of steps twice as
-    long."""
-    y0 = problem.y0
-    if isinstance(problem.solver, AbstractLangevinSplitting):
-        _, y0 = momentum_first(problem.terms, y0)
-        fields = _kicks_at_ends(problem, problem.solver)
-        cure = "Let the function of time return the mean of both sides at a jump"
-        if not problem.solver.has_flow:
-            cure += (
-                ", or pass `BAOAB(ImplicitMidpoint())`, which takes forces within steps"
-            )
-    elif isinstance(problem.solver, AbstractSymplecticRungeKutta):
-        fields = _stages_at_ends(problem, problem.solver)
-        cure = (
-            "Pass a solver that takes forces and noise within steps, such as "
-            "`ImplicitMidpoint()`"
-        )
+    At the time of its jump a field has a single value, such as that of the side before. The
+    step that ends at this time and the step that begins at it both take this value, and for
+    one of them it is wrong. So the mean converges with order 1. But two levels extrapolate
+    by the order of the solver: if it is 2, they report less than the error. Solvers of
+    order 1 are left out.
+
+    It is enough to look at the ends of the shortest steps: they include the ends and the
+    middles of all others."""
+    solver = problem.solver
+    if isinstance(solver, AbstractLangevinSplitting):
+        at_ends = _kicks_at_ends(problem, solver)
+    elif isinstance(solver, AbstractSymplecticRungeKutta):
+        at_ends = _stages_at_ends(problem, solver)
     else:
         return None
-    for what_happens, field in fields.items():
-        end = _first_jump_at_end(field, problem, y0)
+    for what_happens, field in at_ends.fields.items():
+        end = _first_jump_at_end(field, problem, at_ends.y0)
         if end is not None:
             return (
                 f"The {what_happens} at step ends, such as t={end:.6g}, and "
-                f"`{type(problem.solver).__name__}` takes one side of the jump for both "
-                "steps: the mean converges to first order only, and two levels do not see "
-                f"it. {cure}."
+                f"`{type(solver).__name__}` takes one side of the jump for both steps: "
+                "the mean converges to first order only, and two levels do not see it. "
+                f"{at_ends.cure}."
             )
     return None
 
 
-def _kicks_at_ends(
-    problem: Problem, solver: AbstractLangevinSplitting
-) -> dict[str, Field]:
-    """The forces of splittings that begin and end with a kick, by what they would do
-    there."""
-    if not solver.symmetric or not solver.kicks_at_ends:
-        return {}
-    terms, _ = momentum_first(problem.terms, problem.y0)
+class _AtEnds(NamedTuple):
+    """What a solver evaluates at the ends of steps.
+
+    - `fields`: the fields, by what the warning says of their jumps: `forces jump` or
+        `noise jumps`. There are none if the solver has order 1.
+    - `y0`: the initial state that the fields take.
+    - `cure`: what to do about a jump, as a sentence without its period.
+    """
+
+    fields: dict[str, Field]
+    y0: Y
+    cure: str
+
+
+def _kicks_at_ends(problem: Problem, solver: AbstractLangevinSplitting) -> _AtEnds:
+    """The forces of a splitting whose steps begin and end with a kick."""
+    # Diffrax's Langevin terms have the velocity last, and kicks are made of terms that have
+    # it first.
+    terms, y0 = momentum_first(problem.terms, problem.y0)
     drift, _, _ = split_friction(without_constraint(terms))
     kicks, _ = kicks_and_rest(solver.has_flow, drift)
-    return {"forces jump": jtu.Partial(forces, kicks, problem.args)} if kicks else {}
+    fields = {}
+    # Splittings that are not symmetric have order 1.
+    if kicks and solver.symmetric and solver.kicks_at_ends:
+        fields["forces jump"] = jtu.Partial(forces, kicks, problem.args)
+    cure = "Let the function of time return the mean of both sides at a jump"
+    if not solver.has_flow:
+        cure += ", or pass `BAOAB(ImplicitMidpoint())`, which takes forces within steps"
+    return _AtEnds(fields, y0, cure)
 
 
-def _stages_at_ends(
-    problem: Problem, solver: AbstractSymplecticRungeKutta
-) -> dict[str, Field]:
-    """The fields that a tableau evaluates at ends of steps, by what they would do there."""
-    # Two levels extrapolate by the weak order, or by 1 if there is none.
-    if solver.weak_order(problem.terms) in (1, None):
-        return {}
+def _stages_at_ends(problem: Problem, solver: AbstractSymplecticRungeKutta) -> _AtEnds:
+    """The drift and the noise, each if a stage of the tableau evaluates it at the start or
+    the end of a step."""
     drift, noise = split_terms(without_constraint(problem.terms))
     stages = solver.tableau.flatten().stages
     stages_at_ends = [stage for stage in stages if stage.c in (0, 1)]
-    # The others evaluate noise.
+    # All other stages evaluate noise.
     drift_stages = [stage for stage in stages_at_ends if stage.channels == ("h",)]
+    has_noise_stages = len(drift_stages) < len(stages_at_ends)
+    # Stages that change positions alone evaluate velocities, which do not depend on time.
+    has_force_stages = any(stage.writes != "q" for stage in drift_stages)
+    # Without a stated weak order, two levels extrapolate by order 1, too.
+    is_of_order_1 = solver.weak_order(problem.terms) in (1, None)
     fields = {}
-    # Stages that move positions alone evaluate velocities, which do not depend on time.
-    if drift and any(stage.writes != "q" for stage in drift_stages):
+    if drift and has_force_stages and not is_of_order_1:
         fields["forces jump"] = jtu.Partial(drift_rate, drift, problem.args)
-    if noise and len(drift_stages) < len(stages_at_ends):
+    if noise and has_noise_stages and not is_of_order_1:
         fields["noise jumps"] = jtu.Partial(noise_change, noise, problem.args)
-    return fields
+    cure = (
+        "Pass a solver that takes forces and noise within steps, such as "
+        "`ImplicitMidpoint()`"
+    )
+    return _AtEnds(fields, problem.y0, cure)
 
 
 class _Steps(NamedTuple):
     """The shortest steps of a problem, as many as are looked at.
 
     - `starts`, `h`: when they start, and how long they are.
-    - `near`, `far`: how far before and after a time fields are compared: as near as the
-        rounding of times allows, and as far as smooth fields change little.
+    - `near`: a span of time just longer than the rounding errors of times.
+    - `far`: a longer span, over which smooth fields still change little.
+
+    A field jumps at a time `t` if it changes far more from `t - near` to `t + near` than
+    from `t - far` to `t - near` and from `t + near` to `t + far`.
     """
 
     starts: Float[np.ndarray, " steps"]
@@ -171,14 +194,14 @@ class _Steps(NamedTuple):
 
     @property
     def around(self) -> Float[np.ndarray, "4"]:
-        """The times at which fields are compared, from a time between them on."""
+        """The times at which fields are compared, relative to that of a jump."""
         return np.array([-self.far, -self.near, self.near, self.far])
 
 
 def _steps_to_look_at(problem: Problem) -> _Steps | None:
-    """The first steps of the finest level; `None` where times are rounded so coarsely, as
-    in single precision long after time zero, that both sides of the end of a step cannot be
-    told from other parts of the step."""
+    """The first steps of the finest level; `None` if times are rounded so coarsely that the
+    neighbourhood of a jump is a large part of a step, as in single precision long after
+    time zero."""
     h = float(problem.levels.h[-1])
     step_numbers = np.arange(min(problem.finest_steps, _MOST_STEPS))
     starts = float(problem.t0) + h * step_numbers
@@ -191,12 +214,13 @@ def _steps_to_look_at(problem: Problem) -> _Steps | None:
 
 
 def _times_of_jumps(problem: Problem, steps: _Steps) -> Float[np.ndarray, " jumps"]:
-    """When the forces or the noise jump within steps, not at their ends."""
-    # Jumps that are nearer than this to an end of a step do as little harm as those at it,
-    # so both ends are left out.
+    """The times at which the forces or the noise jump within steps, away from their
+    ends."""
+    # Both ends of a step are left out: a jump that is this near to an end does as little
+    # harm as one at the end.
     interior = np.array([steps.far, steps.h - steps.far])
     interiors = (steps.starts[:, None] + interior).astype(problem.dtype)
-    # Bisection goes on until a part of a step is no longer than `near`.
+    # A part of a step is bisected until it is no longer than `near`.
     halvings = max(0, int(np.ceil(np.log2(steps.h / _PARTS_OF_STEP / steps.near))))
     around = steps.around.astype(problem.dtype)
     found = _search(all_fields(problem), problem.y0, interiors, halvings, around)
@@ -205,8 +229,8 @@ def _times_of_jumps(problem: Problem, steps: _Steps) -> Float[np.ndarray, " jump
 
 
 def _first_jump_at_end(field: Field, problem: Problem, y0: Y) -> float | None:
-    """The first end of a step at which a field jumps; `None` if there is none. A jump at
-    `t0` does not count: paths see only the side after it."""
+    """The first end of a step at which a field jumps; `None` if there is none. The start of
+    the first step is not looked at, since paths see only the side after it."""
     if not depends_on_time(field, problem.t0, y0):
         return None
     steps = _steps_to_look_at(problem)
@@ -220,9 +244,9 @@ def _first_jump_at_end(field: Field, problem: Problem, y0: Y) -> float | None:
 
 
 def _largest_smooth_change(sides: Float[Array, "4 n"]) -> Float[Array, ""]:
-    """The largest change of a field that does not count as a jump: several times the
-    changes on both sides, plus an allowance for rounding. `sides` are its values far and
-    near before a time, and near and far after it."""
+    """The largest change of a field at a time that does not count as a jump: several times
+    the changes before and after this time, plus an allowance for rounding. `sides` are the
+    values of the field at the times `_Steps.around`."""
     change_before, _, change_after = jnp.linalg.norm(jnp.diff(sides, axis=0), axis=1)
     size = jnp.linalg.norm(sides)
     rounding = jnp.sqrt(jnp.finfo(size.dtype).eps) * size
@@ -237,12 +261,16 @@ def _search(
     halvings: int,
     around: Float[Array, "4"],
 ) -> tuple[Float[Array, " searched"], Bool[Array, " searched"]]:
-    """For the `intervals`, from a start to an end, in which a field changes most: the time
-    at which it changes fastest, and whether it jumps there, by its values `around` it."""
+    """Searches for jumps of a field in the intervals, each a start and an end, over which
+    the field changes most. Returns for each interval that is searched the time at which the
+    field changes fastest, and whether it jumps there.
+
+    - `halvings`: how often a part of an interval is bisected.
+    - `around`: the times `_Steps.around`."""
     values_at = at_both_states(field, y0)
 
-    def changes(times: Float[Array, " times"]) -> Float[Array, " intervals"]:
-        """The changes from each time to the next."""
+    def changes(times: Float[Array, " times"]) -> Float[Array, " times-1"]:
+        """The size of the change from each time to the next."""
         return jnp.linalg.norm(jnp.diff(values_at(times), axis=0), axis=1)
 
     def with_middle(interval: Float[Array, "2"]) -> Float[Array, "3"]:
@@ -259,39 +287,44 @@ def _search(
         return jnp.where(in_first >= in_second, times[:2], times[1:])
 
     def jump_in(interval: Float[Array, "2"]) -> tuple[Array, Bool[Array, ""]]:
+        """The time at which the field changes fastest, and whether it jumps there."""
         times = jnp.linspace(interval[0], interval[1], _PARTS_OF_STEP + 1)
+        # The start and the end of the part that changes most.
         part = times[jnp.argmax(changes(times)) + jnp.arange(2)]
         time = jnp.mean(lax.fori_loop(0, halvings, half_that_changes_more, part))
         sides = values_at(time + around)
-        jump = jnp.linalg.norm(sides[2] - sides[1])
-        return time, jump > _largest_smooth_change(sides)
+        change = jnp.linalg.norm(sides[2] - sides[1])
+        return time, change > _largest_smooth_change(sides)
 
-    changes_in_steps = lax.map(largest_change, intervals, batch_size=_STEPS_AT_ONCE)
+    largest_changes = lax.map(largest_change, intervals, batch_size=_STEPS_AT_ONCE)
     num_searched = min(_MOST_STEPS_SEARCHED, len(intervals))
-    _, largest = lax.top_k(changes_in_steps, num_searched)
-    return jax.vmap(jump_in)(intervals[largest])
+    _, which = lax.top_k(largest_changes, num_searched)
+    return jax.vmap(jump_in)(intervals[which])
 
 
 @ft.partial(compiled, quickly=True)
 def _jumps_at_ends(
     field: Field, y0: Y, times: Float[Array, "ends 5"], is_last: Bool[Array, " ends"]
 ) -> Bool[Array, " ends"]:
-    """For the end of each step, whether a field jumps there, and does not have the mean of
-    both sides as its value, which would be right. `times` are far and near before the end,
-    near and far after it, and the end itself."""
+    """For the end of each step, whether a field jumps there and has a wrong value at it.
+    The mean of both sides is a right value.
+
+    - `times`: for each end the four times of `_Steps.around`, and the end itself.
+    - `is_last`: whether no step follows."""
     values_at = at_both_states(field, y0)
 
     def jumps_at(end: tuple[Array, Array]) -> Bool[Array, ""]:
-        times, is_last = end
-        values = values_at(times)
+        times_of_end, is_end_of_path = end
+        values = values_at(times_of_end)
         sides = values[:4]
-        value = values[4]
-        off_mean = jnp.linalg.norm(value - (sides[1] + sides[2]) / 2)
-        # No step follows the last end, so the value of the side before is right there, too.
-        off_before = jnp.linalg.norm(value - sides[1])
-        error = jnp.where(is_last, jnp.minimum(off_mean, off_before), off_mean)
-        # A field with the value of one side is off the mean by half of its jump. (With a
-        # NaN among the values, the comparison is false: that is no jump.)
+        _, just_before, just_after, _ = sides
+        at_end = values[4]
+        error = jnp.linalg.norm(at_end - (just_before + just_after) / 2)
+        # If no step follows, the value of the side before is right, too.
+        error_before = jnp.linalg.norm(at_end - just_before)
+        error = jnp.where(is_end_of_path, jnp.minimum(error, error_before), error)
+        # With the value of one side, the error is half of the jump. (If a value is NaN, the
+        # comparison is false: that is no jump.)
         return 2 * error > _largest_smooth_change(sides)
 
     return lax.map(jumps_at, (times, is_last), batch_size=_STEPS_AT_ONCE)

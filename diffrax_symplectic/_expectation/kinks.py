@@ -28,8 +28,8 @@ def has_kinks(problem: Problem) -> bool:
 
 
 def may_have_kinks(fn: Callable, y: PyTree) -> bool:
-    """Whether `fn(y)` depends on an operation that is not smooth in `y`, such as `abs`, a
-    maximum or a comparison. Some functions that depend on one are smooth all the same."""
+    """Whether `fn(y)` depends on an operation on `y` that is not smooth, such as `abs`, a
+    maximum or a comparison. Some functions that do are smooth all the same."""
     leaves, treedef = jtu.tree_flatten(y)
     traced = jax.make_jaxpr(lambda *leaves: fn(treedef.unflatten(leaves)))(*leaves)
     return _may_be_rough(traced.jaxpr)
@@ -38,9 +38,9 @@ def may_have_kinks(fn: Callable, y: PyTree) -> bool:
 def _may_be_rough(jaxpr: Jaxpr) -> bool:
     """Whether the results of a program depend on an operation that is not smooth, applied
     to variables that depend on its inputs."""
-    # An operation that no result needs, such as a comparison for a message, is left out.
+    # Leave out operations that no result needs, such as a comparison for a message.
     jaxpr, _ = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
-    # The variables that depend on an input. Arrays that the function captures do not.
+    # The variables that depend on an input. (Arrays that the function captures do not.)
     dependent = set(jaxpr.invars)
     for eqn in jaxpr.eqns:
         operands = [x for x in eqn.invars if not isinstance(x, Literal)]

@@ -1,5 +1,5 @@
-"""What a linear map does to vectors that it is applied to again and again, by power
-iteration, and directions without symmetries."""
+"""Power iteration: what becomes of a vector to which a linear map is applied again and
+again. The maps are derivatives of vector fields."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -13,8 +13,8 @@ from jaxtyping import Array, Float, PyTree
 from .._custom_types import Y
 
 
-# So many applications of power iteration find the direction of the largest frequency, and
-# as many more measure it.
+# This many applications of power iteration find the direction of the largest frequency, and
+# as many more measure the frequency.
 _ITERATIONS_FOR_FREQUENCY = 15
 
 
@@ -39,10 +39,10 @@ class Growth(NamedTuple):
 
     - `direction`: the direction after the last application, scaled to length one.
     - `log_growth`: the logarithm of the factor by which one application changes the length,
-        averaged over the second half of them.
-    - `rayleigh_quotient`: `x @ A(x)` for the direction `x` before the last application, of
-        length one. For a symmetric map this is the eigenvalue of largest size. It is
-        negative if the map turns the direction around.
+        averaged over the second half of the applications.
+    - `rayleigh_quotient`: `x @ A(x)` for the direction `x` before the last application,
+        scaled to length one. It is negative if the map turns the direction around. For a
+        symmetric map it is the eigenvalue of largest size.
     """
 
     direction: Float[Array, "*times n"]
@@ -58,7 +58,7 @@ def largest_growth(
 
     def after_map(number: Array, before: Growth) -> Growth:
         mapped = linear(before.direction)
-        # Before the map the length is one, so this is the factor by which it grows.
+        # The direction has length one, so this is the factor by which the length grows.
         length = jnp.linalg.norm(mapped)
         counted_log = jnp.where(number < iterations, 0.0, jnp.log(length))
         log_growth = before.log_growth + counted_log / iterations
@@ -67,7 +67,8 @@ def largest_growth(
         scaled = jnp.where(length > 0, mapped / length, before.direction)
         return Growth(scaled, log_growth, rayleigh_quotient)
 
-    # It is a sum of all eigenvectors. The one that grows most outgrows the others.
+    # This direction is a sum of all eigenvectors. The one that grows most outgrows the
+    # others.
     direction = arbitrary_direction(like.size, like.dtype)
     zero = jnp.zeros((), like.dtype)
     start = Growth(direction / jnp.linalg.norm(direction), zero, zero)
@@ -81,9 +82,9 @@ def largest_frequency(
     where growth without oscillation is faster."""
     derivative, flat_y0 = linearized(field, t, y0)
 
-    # The derivative has the eigenvalues i omega and -i omega of an oscillation, for which
-    # power iteration does not converge. Its square has -omega^2 for all directions in the
-    # plane of the oscillation.
+    # The derivative has the eigenvalues i omega and -i omega for an oscillation, with which
+    # power iteration does not converge. Applied twice, it multiplies every direction in the
+    # plane of the oscillation by -omega^2.
     def derivative_twice(change: Array) -> Array:
         # A loop, so that the derivative is compiled once.
         return lax.fori_loop(0, 2, lambda _, change: derivative(change), change)

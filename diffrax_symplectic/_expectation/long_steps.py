@@ -1,5 +1,12 @@
-"""Whether steps are too long for a solver or for the noise, for the state in which paths
-start."""
+"""Whether steps are too long for a solver or for the noise, in the state `y0` in which
+paths start.
+
+Four checks, each by power iteration or eigenvalues of a derivative at `y0`: explicit steps
+must be stable, some solvers must resolve the largest frequency of the drift, implicit steps
+must let decaying modes decay, and noise must not turn the state far in a step. In an
+oscillation of angular frequency omega, a step of length h turns the state by the angle
+omega h.
+"""
 
 import functools as ft
 from collections.abc import Callable
@@ -32,108 +39,140 @@ from .fields_in_time import depends_on_time, drift_rate, spread_evenly
 from .linear_maps import Growth, largest_frequency, largest_growth, linearized
 
 
-# A step that enlarges a small change of the state by more than this, and turns it around,
-# is unstable. Exact flows turn changes around, too, but over a step that resolves them they
-# do not enlarge them at the same time. On an oscillator of frequency omega the steps of
-# `StormerVerlet` enlarge changes by this factor at omega h = 2.003.
+# A step is unstable if it enlarges a small change of the state by more than this factor,
+# and turns the change around. (Exact flows may also do both, but not in a step that
+# resolves them.) On an oscillator of frequency omega the steps of `StormerVerlet` enlarge
+# changes by this factor at omega h = 2.003.
 _UNSTABLE = 1.1
-# After this many steps of the tangent flow any change of the state points in the most
-# unstable direction. Its growth is measured over as many more steps.
+# After this many applications of the derivative of a step, any small change of the state
+# points in the most unstable direction. Its growth is measured over as many more.
 _ITERATIONS_FOR_INSTABILITY = 50
 # Where noise turns the state by more than this in a step, as a standard deviation, two
 # levels may agree on a wrong mean. Measured for the mean square of the site of an exciton
 # on 3 and 7 sites with noise, by `ImplicitMidpoint`: at 1.4 and below the mean is within
-# 1.4 bars, at 2 it is 2 to 6 bars off, and at 3.2 (by `StrangGauss`, too) it is 4 off.
-# On a quartic oscillator whose phase is noisy it is within 1.2 bars up to 2.2, but at 1,
-# where the error of the step changes its sign, 2.4 off: no angle is safe for all systems.
+# 1.4 error bars, at 2 it is 2 to 6 bars off, and at 3.2 (by `StrangGauss`, too) 4 bars off.
+# No angle is safe for all systems: for a quartic oscillator with a noisy phase the mean is
+# within 1.2 bars up to 2.2, but 2.4 bars off at 1, where the error of the step changes its
+# sign.
 _MOST_TURNED_BY_NOISE = 1.5
-# In how many random directions of the noise this angle is measured.
+# This angle is measured for so many random choices of the signs of the increments.
 _NUM_DIRECTIONS = 4
-# Steps that turn the state by less than this resolve a rotation: two levels then differ by
-# more than what they miss. Measured for a charge in a magnetic field by
-# `BAOAB(ImplicitMidpoint())`: within 0.3 bars up to an angle of 2.4, 24 off at 4.8. For a
-# particle on a tilted washboard by `BAOAB()`: within 2.3 bars at 1.25, 16 off at 1.4.
+# Steps that turn the state by less than this angle resolve a rotation: two levels then
+# differ by more than the error of their extrapolation. Measured for a charge in a magnetic
+# field by `BAOAB(ImplicitMidpoint())`: the mean is within 0.3 error bars up to an angle of
+# 2.4, and 24 bars off at 4.8. For a particle on a tilted washboard by `BAOAB()`: within 2.3
+# bars at 1.25, and 16 off at 1.4.
 _RESOLVED = 1.2
-# An implicit step takes a mode that turns by the angle omega h toward its mean by
-# 1 + (omega h / 2)^2 times less than its decay: less than half of it from here on. Measured
-# for an oscillator with friction by `ImplicitMidpoint`: two levels and a trial see it up to
-# omega h = 60, and at 200 all levels keep the energy of the start.
+# An implicit step that turns a mode by the angle omega h damps it by 1 + (omega h / 2)^2
+# times less than the mode decays: by less than half from this angle on. Measured for an
+# oscillator with friction by `ImplicitMidpoint`: two levels and a trial show the error up
+# to omega h = 60, and at 200 all levels keep the energy of the start.
 _TURNS_TOO_FAR_TO_DECAY = 2.0
-# A mode that loses less than this part of its amplitude over the interval has no decay to
-# miss.
+# A mode that loses less than this part of its amplitude over the interval does not count as
+# decaying.
 _LEAST_DECAY = 0.01
 # Rates of decay below this fraction of the largest rate may be rounding errors of it, in
 # single precision.
 _ROUNDING_OF_RATES = 1e-6
-# The largest number of numbers in a state of which all modes are known: the eigenvalues of
-# 256 take 0.1 s.
+# The most numbers in a state whose modes are computed: the eigenvalues of 256 take 0.1 s.
 _MOST_MODES = 256
-# The number of steps to look at where the drift depends on time.
+# If the drift depends on time, this many steps are looked at, spread over the interval.
 _NUM_TIMES = 64
 
 
 def too_long_steps(problem: Problem, dt0: float) -> str | None:
-    """What is wrong with steps of `dt0` for the state in which paths start, as a sentence;
-    `None` if nothing is, or for solvers of others. Two levels need not show it.
+    """A warning if steps of `dt0` are too long for the solver, in the state in which paths
+    start; `None` if they are not, or for solvers of other packages. Two levels need not
+    show that steps are too long.
 
-    Explicit solvers must be stable, with increments of zero. A solver with a
-    `Record.most_frequency` must resolve the frequencies of the drift, and every implicit
-    one those that decay. If the drift depends on time, this looks at steps from all over
-    the interval, and otherwise at the first.
+    If the drift depends on time, steps from all over the interval are looked at, and
+    otherwise the first.
 
-    This sees the frequencies at `y0` alone. A look at the states of a path without noise,
-    too, did not find steps of a thirtieth of the period too long on an ellipse of
-    eccentricity 0.8."""
-    solver = problem.solver
-    if not isinstance(solver, AbstractSymplecticSolver):
+    Frequencies are those at `y0` alone. To look at the states of a path without noise, too,
+    did not help: it did not show that steps of a thirtieth of the period are too long on an
+    ellipse of eccentricity 0.8."""
+    if not _can_step_without_noise(problem):
         return None
-    if not _has_step_without_noise(problem):
-        return None
-    beginning = f"Steps of `dt0={dt0:g}` are too long for `{type(solver).__name__}`"
     if not problem.is_implicit:
-        step_numbers = _step_numbers_to_look_at(problem)
-        growth = _growth_in_steps(problem, step_numbers)
-        is_unstable = growth.log_growth > np.log(_UNSTABLE)
-        is_unstable &= growth.rayleigh_quotient < 0
-        if not np.any(is_unstable):
-            return None
-        where = _where_step_begins(problem, step_numbers[np.argmax(is_unstable)])
-        return (
-            f"{beginning} {where}: a small change of the state grows in each step, with "
-            "alternating signs. Where forces are bounded, such steps leave random states, "
-            "and two levels may agree on a wrong mean. Pass a smaller `dt0`."
-        )
+        return _unstable_steps(problem, dt0)
     angle, step_number = _largest_angle(problem)
-    where = _where_step_begins(problem, step_number)
-    most_frequency = None if solver.record is None else solver.record.most_frequency
-    # Three levels are checked for the order, which shows this.
+    message = _unresolved_frequency(problem, dt0, angle, step_number)
+    return message or _missed_decay(problem, dt0, angle, step_number)
+
+
+def _unstable_steps(problem: Problem, dt0: float) -> str | None:
+    """A warning if an explicit step, with increments of zero, is unstable."""
+    step_numbers = _step_numbers_to_look_at(problem)
+    growth = _growth_in_steps(problem, step_numbers)
+    # The step enlarges a small change, and turns it around.
+    is_unstable = growth.log_growth > np.log(_UNSTABLE)
+    is_unstable &= growth.rayleigh_quotient < 0
+    if not np.any(is_unstable):
+        return None
+    first_unstable = step_numbers[np.argmax(is_unstable)]
+    return (
+        f"{_too_long(problem, dt0, first_unstable)}: a small change of the state grows in "
+        "each step, with alternating signs. Where forces are bounded, such steps leave "
+        "random states, and two levels may agree on a wrong mean. Pass a smaller `dt0`."
+    )
+
+
+def _unresolved_frequency(
+    problem: Problem, dt0: float, angle: float, step_number: np.floating
+) -> str | None:
+    """A warning if the largest angle by which the drift turns the state, in the step with
+    this number, is more than the `Record.most_frequency` of the solver."""
+    assert isinstance(problem.solver, AbstractSymplecticSolver)
+    record = problem.solver.record
+    most_frequency = None if record is None else record.most_frequency
+    # Three levels check the order, which shows an unresolved frequency.
     is_order_checked = len(problem.levels.h) > 2
-    if most_frequency is not None and angle > most_frequency and not is_order_checked:
-        return (
-            f"{beginning} {where}: omega h = {angle:.3g} for the largest frequency of the "
-            f"drift, and with omega h > {most_frequency:g} two levels may agree on a wrong "
-            "mean. Pass a smaller `dt0`, or `levels=3`, which checks the order."
-        )
+    if most_frequency is None or is_order_checked or not angle > most_frequency:
+        return None
+    return (
+        f"{_too_long(problem, dt0, step_number)}: omega h = {angle:.3g} for the largest "
+        f"frequency of the drift, and with omega h > {most_frequency:g} two levels may "
+        "agree on a wrong mean. Pass a smaller `dt0`, or `levels=3`, which checks the "
+        "order."
+    )
+
+
+def _missed_decay(
+    problem: Problem, dt0: float, angle: float, step_number: np.floating
+) -> str | None:
+    """A warning if a mode decays, but implicit steps turn it so far that they hardly damp
+    it. `angle` is the largest angle by which the drift turns the state, in the step with
+    this number."""
+    # Eigenvalues take long. They are only computed if the drift turns the state this far.
     if not angle > _TURNS_TOO_FAR_TO_DECAY or problem.num_components > _MOST_MODES:
         return None
-    decaying_angle = _largest_decaying_angle(problem, step_number, dt0)
+    decaying_angle = _decaying_angle(problem, step_number, dt0)
     if not decaying_angle > _TURNS_TOO_FAR_TO_DECAY:
         return None
     return (
-        f"{beginning} {where}: a mode with omega h = {decaying_angle:.3g} decays, and "
-        "implicit steps that turn it by more than "
+        f"{_too_long(problem, dt0, step_number)}: a mode with omega h = "
+        f"{decaying_angle:.3g} decays, and implicit steps that turn it by more than "
         f"{_TURNS_TOO_FAR_TO_DECAY:g} keep it, so that it relaxes far too slowly on every "
         "level. Pass a smaller `dt0`, or for Langevin terms `BAOAB(ImplicitMidpoint())`, "
         "which solves the friction by itself."
     )
 
 
-def _largest_decaying_angle(
-    problem: Problem, step_number: np.floating, dt0: float
-) -> float:
-    """The largest angle by which a mode that decays turns in a step, by the part of the
-    drift that the equations of the step with this number contain, at `y0`; zero if none
-    decays. Steps on every level keep its amplitude if it is large."""
+def _too_long(problem: Problem, dt0: float, step_number: np.floating) -> str:
+    """The beginning of a warning, with the time at which the step with this number begins
+    on the first level."""
+    where = "where paths start"
+    if step_number != 0:
+        t = float(problem.t0) + step_number * float(problem.level(0).h)
+        where = f"at t = {t:.4g}, for the state in which paths start"
+    solver_name = type(problem.solver).__name__
+    return f"Steps of `dt0={dt0:g}` are too long for `{solver_name}` {where}"
+
+
+def _decaying_angle(problem: Problem, step_number: np.floating, dt0: float) -> float:
+    """The largest angle by which the step with this number turns a mode that decays; zero
+    if none decays. The modes are those of the drift in the implicit equations of the step,
+    at `y0`."""
     # A mode decays with the negative real part of its eigenvalue, and turns with the
     # imaginary part.
     jacobian = np.asarray(_jacobian_of_step(problem, step_number), float)
@@ -142,7 +181,8 @@ def _largest_decaying_angle(
     duration = float(problem.level(0).num_steps) * dt0
     rounding = _ROUNDING_OF_RATES * np.max(np.abs(eigenvalues))
     least_rate = max(_LEAST_DECAY / duration, rounding)
-    # Without friction, modes grow and decay in pairs, and these rates add up to zero.
+    # Without friction, each mode that decays is paired with one that grows as fast, so that
+    # the rates add up to zero.
     if not np.sum(decay_rates) > least_rate:
         return 0.0
     angles = np.abs(eigenvalues.imag[decay_rates > least_rate]) * dt0
@@ -150,8 +190,8 @@ def _largest_decaying_angle(
 
 
 def unresolved_angle(problem: Problem) -> float | None:
-    """The largest angle by which a step turns the state in which paths start, in radians;
-    `None` if steps resolve it, and two levels differ by more than what they miss."""
+    """The largest angle in radians by which a step turns the state in which paths start;
+    `None` if steps resolve the rotation, or for terms with a constraint."""
     if constraint_of(problem.terms) is not None:
         return None
     angle, _ = _largest_angle(problem)
@@ -159,8 +199,8 @@ def unresolved_angle(problem: Problem) -> float | None:
 
 
 def _largest_angle(problem: Problem) -> tuple[float, np.floating]:
-    """The largest angle by which a step on the first level turns the state in which paths
-    start, by the drift without friction, in radians; and the number of this step."""
+    """The largest angle in radians by which the drift without friction turns the state in
+    which paths start, in a step on the first level; and the number of this step."""
     step_numbers = _step_numbers_to_look_at(problem)
     frequencies = np.asarray(drift_frequencies(problem, step_numbers))
     largest = np.argmax(frequencies)
@@ -169,11 +209,9 @@ def _largest_angle(problem: Problem) -> tuple[float, np.floating]:
 
 
 def unresolved_noise(problem: Problem, dt0: float) -> str | None:
-    """What is wrong with steps of `dt0` for noise that depends on the state in which paths
-    start, as a sentence; `None` if nothing is, or for solvers of others."""
-    if not isinstance(problem.solver, AbstractSymplecticSolver):
-        return None
-    if not _has_step_without_noise(problem) or not _noise_reads_state(problem):
+    """A warning if noise that depends on the state turns it far in a step of `dt0`, where
+    paths start; `None` if it does not, or for solvers of other packages."""
+    if not _can_step_without_noise(problem) or not _noise_reads_state(problem):
         return None
     angle = float(_noise_frequency(problem)) * dt0**0.5
     if not angle > _MOST_TURNED_BY_NOISE:
@@ -186,16 +224,18 @@ def unresolved_noise(problem: Problem, dt0: float) -> str | None:
     )
 
 
-def _has_step_without_noise(problem: Problem) -> bool:
-    """Whether increments can be set to zero."""
-    if constraint_of(problem.terms) is not None:
+def _can_step_without_noise(problem: Problem) -> bool:
+    """Whether a solver of this package takes the steps, without a constraint, and with
+    increments that may be set to zero."""
+    is_own = isinstance(problem.solver, AbstractSymplecticSolver)
+    if not is_own or constraint_of(problem.terms) is not None:
         return False
     return not any(map(has_unknown_law, brownian_paths(problem.terms)))
 
 
 def _step_numbers_to_look_at(problem: Problem) -> Float[np.ndarray, " times"]:
-    """The numbers of the steps to look at: the first alone if the drift does not depend on
-    time."""
+    """The numbers of the steps to look at: some from all over the interval if the drift
+    depends on time, and otherwise only the first."""
     drift, _, _ = split_friction(problem.terms)
     field = jtu.Partial(drift_rate, drift, problem.args)
     if not drift or not depends_on_time(field, problem.t0, problem.y0):
@@ -204,19 +244,12 @@ def _step_numbers_to_look_at(problem: Problem) -> Float[np.ndarray, " times"]:
     return np.floor(spread_evenly(_NUM_TIMES) * num_steps).astype(problem.dtype)
 
 
-def _where_step_begins(problem: Problem, step_number: np.floating) -> str:
-    """Where a step on the first level begins, for messages."""
-    if step_number == 0:
-        return "where paths start"
-    t = float(problem.t0) + step_number * float(problem.level(0).h)
-    return f"at t = {t:.4g}, for the state in which paths start"
-
-
 def _noise_of_user(
     problem: Problem,
 ) -> tuple[Callable[[Y, Array], Y], Float[Array, " m"]]:
-    """The change of a state by increments of the noise but that of heat baths, which acts
-    on momenta alone; and these increments as one vector, zero."""
+    """The function from a state and the increments of the noise, as one vector, to the
+    change of the state; and a vector of increments that are zero. The noise of heat baths,
+    which acts on momenta alone, is left out."""
     _, _, noise = split_friction(problem.terms)
     noise = tuple(term for term in noise if not isinstance(unwrapped(term), BathNoise))
     structs = [control_struct(term, problem.t0) for term in noise]
@@ -231,8 +264,8 @@ def _noise_of_user(
 @once_for_each_signature
 def _noise_reads_state(problem: Problem) -> bool:
     """Whether the change of the state by noise depends on the state, apart from the noise
-    of heat baths. Its program is looked at, not its derivative, which may be zero at
-    `y0`."""
+    of heat baths. This is whether its program reads the state: the derivative may be zero
+    at `y0`."""
     change, controls = _noise_of_user(problem)
     if controls.size == 0:
         return False
@@ -242,10 +275,9 @@ def _noise_reads_state(problem: Problem) -> bool:
 
 @ft.partial(compiled, quickly=True)
 def _growth_in_steps(problem: Problem, numbers: Float[Array, " times"]) -> Growth:
-    """For each of the steps with these numbers, started from `y0`: the growth of the change
-    of `y0` that the derivative of the step enlarges most."""
+    """For each of the steps with these numbers, taken from `y0` with increments of zero:
+    the growth of the small change of `y0` that the step enlarges most."""
     h = problem.level(0).h
-    # With increments of zero.
     variables = problem.variables(h)
     terms = variables.terms_with(jnp.zeros(len(variables.laws)))
 
@@ -266,8 +298,9 @@ def _growth_in_steps(problem: Problem, numbers: Float[Array, " times"]) -> Growt
 def drift_frequencies(
     problem: Problem, numbers: Float[Array, " times"]
 ) -> Float[Array, " times"]:
-    """The largest angular frequency of the drift without friction at `y0`, at the starts of
-    the steps with these numbers; zero where growth without oscillation is faster."""
+    """The largest angular frequency of the drift without friction, at `y0` and the start
+    of each of the steps with these numbers; zero where growth without oscillation is
+    faster."""
     drift, _, _ = split_friction(problem.terms)
     if not drift:
         return jnp.zeros_like(numbers)
@@ -284,9 +317,9 @@ def drift_frequencies(
 def _jacobian_of_step(
     problem: Problem, step_number: Float[Array, ""]
 ) -> Float[Array, "n n"]:
-    """The derivative at `y0`, at the start of the step with this number, of the drift that
-    the implicit equations of a step contain: with the friction, except for splittings,
-    which solve the friction by itself."""
+    """The derivative at `y0` of the drift in the implicit equations of the step with this
+    number. It contains the friction, except for splittings, which solve the friction by
+    itself."""
     drift, friction, _ = split_friction(problem.terms)
     if isinstance(problem.solver, AbstractLangevinSplitting):
         friction = ()
@@ -299,9 +332,9 @@ def _jacobian_of_step(
 
 @ft.partial(compiled, quickly=True)
 def _noise_frequency(problem: Problem) -> Float[Array, ""]:
-    """The angle by which noise turns a change of the state at `y0` within time 1, as a
-    standard deviation: the largest over some random directions of the noise, in which all
-    increments have the size of their standard deviation."""
+    """The angle by which noise turns a small change of the state at `y0` within time 1, as
+    a standard deviation. This is the largest angle over some random choices of the signs of
+    the increments, each of which has the size of its standard deviation."""
     change, zeros = _noise_of_user(problem)
 
     def frequency(key: PRNGKeyArray) -> Float[Array, ""]:

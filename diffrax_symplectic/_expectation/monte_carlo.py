@@ -130,8 +130,8 @@ def monte_carlo(
     weights = level_weights(float(order or 1), levels)
     progress = Progress("monte_carlo", progress_meter, "a small `num_paths`")
     with ShortTraceback(), Kept() as kept, progress:
-        # A level is a Python integer, by which a function may choose its step, so each
-        # level is a program of its own. With one level, `fn` takes the key alone.
+        # Each level is a program of its own: `fn` takes the level as a Python integer, by
+        # which it may choose its step. With one level, `fn` takes the key alone.
         arguments_after_key = [()] if levels == 1 else [(k,) for k in range(levels)]
         with current_traces(fn):
             programs = [
@@ -140,7 +140,7 @@ def monte_carlo(
             ]
         check_untraced("`monte_carlo`", programs)
         sampler = jtu.Partial(_samples_of_programs, programs, weights)
-        # A path has at least a number of four bytes on each level.
+        # On each level a path has at least one number, of four bytes.
         plan = sampling.plan(sampler, _outputs(programs, key), devices, 4 * levels)
         progress.stage("compiling and sampling")
         estimate = run(
@@ -148,15 +148,14 @@ def monte_carlo(
             sampling=sampling,
             digests=dict(fn=digest(programs), order=digest(order)),
         )  # fmt: skip
-        advice = advice_on_failures(None)
-        for message in cautions(estimate, tol, advice):
+        for message in cautions(estimate, tol, advice=advice_on_failures(None)):
             warnings.warn(message, stacklevel=2)
     return estimate
 
 
 def _outputs(programs: list[Traced], key: PRNGKeyArray) -> Outputs:
-    """The numbers of phi, from the program of each level. Raises a `ValueError` unless phi
-    has the same layout on all levels."""
+    """What the numbers of phi are, by the program of each level. Raises a `ValueError`
+    unless phi has the same layout on all levels."""
     structs = [jax.eval_shape(program, key)[0] for program in programs]
     layout, *other_layouts = map(Layout.of, structs)
     if any(other != layout for other in other_layouts):
@@ -164,7 +163,7 @@ def _outputs(programs: list[Traced], key: PRNGKeyArray) -> Outputs:
             "`fn` must return a phi of the same structure and shapes on all levels; got "
             f"{', '.join(map(shapes, structs))}."
         )
-    # Rounding errors are those of the least precise of the dtypes.
+    # Rounding errors are those of the least precise dtype in phi.
     dtypes = {leaf.dtype for leaf in jtu.tree_leaves(structs)}
     dtype = min(dtypes, key=lambda dtype: jnp.finfo(dtype).bits)
     return Outputs(layout, len(programs), str(dtype))
@@ -175,8 +174,8 @@ def _samples_of_programs(
     weights: Float[Array | np.ndarray, "combinations levels"],
     keys: Key[Array, " n"],
 ) -> Samples:
-    """A sample is a value of the function, with the same random key on all levels, for each
-    of which there is a program."""
+    """The samples of the user's function, with one program for each level. A sample has the
+    same random key on all levels."""
     phi_and_success = [jax.vmap(program)(keys) for program in programs]
     # (levels, n, numbers) and (levels, n)
     values = jnp.stack([jax.vmap(real_vector)(phi) for phi, _ in phi_and_success])
@@ -188,7 +187,7 @@ def _value_and_success(
     fn: Callable, arguments: tuple[int, ...], key: PRNGKeyArray
 ) -> tuple[PyTree[Array], Bool[Array, ""]]:
     """The $\\phi$ that `fn(key, *arguments)` returns, in floating-point numbers, and
-    whether the path succeeded."""
+    whether the path succeeded. `arguments` is the level, or empty with one level."""
     phi = fn(key, *arguments)
     success = jnp.array(True)
     is_pair = isinstance(phi, tuple) and len(phi) == 2

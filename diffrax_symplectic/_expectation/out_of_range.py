@@ -24,9 +24,9 @@ _ARITHMETIC = {"mul": "*", "div": "/", "integer_pow": "to a power", "square": "s
 
 
 def out_of_range(problem: Problem, all_fail: bool) -> str | None:
-    """Names an argument that counts as zero or infinite in its precision; or else, if
-    `all_fail` (whether paths do), an operation whose result is out of range where paths
-    start. Two sentences for messages, or `None`."""
+    """A warning that names an argument that counts as zero or infinite in its precision. If
+    there is no such argument, but all paths fail, it names an operation whose result is out
+    of range where paths start. `None` if there is no such operation, either."""
     precision = jnp.finfo(problem.dtype)
     found = next(_lost_arguments(problem), None)
     if found is None and all_fail:
@@ -43,8 +43,8 @@ def out_of_range(problem: Problem, all_fail: bool) -> str | None:
 
 
 def _lost_arguments(problem: Problem) -> Iterator[str]:
-    """Names each argument with an array in which all numbers count as zero, though not all
-    are, or a finite one counts as infinite."""
+    """Names each argument with an array in which some number is not zero, but all count as
+    zero, or some number is finite, but counts as infinite."""
     arguments = {"y0": problem.y0, "args": problem.args, "dt0": problem.levels.h[0]}
     _, noise = split_terms(problem.terms)
     for term in noise:
@@ -57,7 +57,8 @@ def _lost_arguments(problem: Problem) -> Iterator[str]:
             # Numbers of Python have the precision of the state.
             precision = jnp.finfo(jnp.result_type(leaf, problem.dtype))
             size = float(np.max(np.abs(_in_float64(leaf)), initial=0))
-            # Numbers below `tiny` lose digits, and most processors take them for zero.
+            # Numbers below `tiny` have fewer digits, and most processors take them for
+            # zero.
             if 0 < size < precision.tiny:
                 yield f"`{name}` of {size:.2g} counts as zero"
             if precision.max < size < np.inf:
@@ -72,7 +73,7 @@ def is_finite_at_start(problem: Problem) -> bool:
 
 def _first_evaluation(problem: Problem, y0: Y) -> tuple[list[PyTree], PyTree]:
     """The change of the state by each term, with increments of one, and `phi`, where paths
-    start."""
+    start, from `y0`."""
     t0, args = problem.t0, problem.args
     changes = []
     for term in itertools.chain(*split_terms(problem.terms)):
@@ -84,11 +85,11 @@ def _first_evaluation(problem: Problem, y0: Y) -> tuple[list[PyTree], PyTree]:
 
 def _lost_on_the_way(problem: Problem) -> str | None:
     """Names the first operation whose result is out of range, if the change of the state or
-    `phi` is not finite at the start; `None` otherwise. Evaluates both one operation after
-    another, to look at the results in between."""
+    `phi` is not finite at the start; `None` otherwise. To look at the results in between,
+    the change and `phi` are evaluated one operation after another."""
     if is_finite_at_start(problem):
         return None
-    losses: list[str] = []
+    losses: list[str | None] = []
 
     def results_of(eqn: Any, values: list[Any]) -> Sequence[Any]:
         name = eqn.primitive.name
@@ -96,31 +97,33 @@ def _lost_on_the_way(problem: Problem) -> str | None:
             return results_of_program(eqn.params[CALLS[name]], values, results_of)
         results = results_of_operation(eqn, values, eqn.params)
         if name in _ARITHMETIC and _is_float(results[0]):
-            losses.extend(_loss(name, values, results[0]))
+            losses.append(_loss(name, values, results[0]))
         return results
 
     traced = jax.make_jaxpr(ft.partial(_first_evaluation, problem))(problem.y0)
     results_of_program(traced, jtu.tree_leaves(problem.y0), results_of)
-    return next(iter(losses), None)
+    return next(filter(None, losses), None)
 
 
-def _loss(name: str, values: list[Any], result: Any) -> Iterator[str]:
-    """The first entry that overflowed or underflowed in an operation of arithmetic, such as
-    `1e-30 * 1e-30 is 0`; nothing if there is none."""
+def _loss(name: str, values: list[Any], result: Any) -> str | None:
+    """The first entry of the result of an arithmetic operation that overflowed or
+    underflowed, such as `1e-30 * 1e-30 is 0`; `None` if no entry did."""
     results = _in_float64(result)
     operands = [np.broadcast_to(_in_float64(x), results.shape) for x in values]
-    # If an operand is already zero or infinite, so may be the result, with nothing lost.
-    has_size = np.all([np.isfinite(x) & (x != 0) for x in operands], axis=0)
-    is_lost = has_size & ((results == 0) | ~np.isfinite(results))
-    if np.any(is_lost):
-        texts = [f"{operand[is_lost][0]:.2g}" for operand in operands]
-        sign = _ARITHMETIC[name]
-        formula = f" {sign} ".join(texts) if len(texts) > 1 else f"{texts[0]} {sign}"
-        yield f"{formula} is {'0' if results[is_lost][0] == 0 else 'infinite'}"
+    # If an operand is already zero or infinite, the result may be so with nothing lost.
+    is_in_range = np.all([np.isfinite(x) & (x != 0) for x in operands], axis=0)
+    is_lost = is_in_range & ((results == 0) | ~np.isfinite(results))
+    if not np.any(is_lost):
+        return None
+    texts = [f"{operand[is_lost][0]:.2g}" for operand in operands]
+    sign = _ARITHMETIC[name]
+    formula = f" {sign} ".join(texts) if len(texts) > 1 else f"{texts[0]} {sign}"
+    return f"{formula} is {'0' if results[is_lost][0] == 0 else 'infinite'}"
 
 
 def _is_float(x: Any) -> bool:
-    """Whether this is a real array or number. Arguments may hold functions, too."""
+    """Whether this is an array or number of floating point. (Arguments may also hold
+    integers and functions.)"""
     return eqx.is_array_like(x) and jnp.issubdtype(jnp.result_type(x), jnp.floating)
 
 

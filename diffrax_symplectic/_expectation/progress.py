@@ -15,10 +15,11 @@ _SECONDS_OF_SILENCE = 5.0
 
 
 class Progress:
-    """What a call is doing and how far it is, as a context manager. With a progress meter
-    of Diffrax the meter shows it. Without one, a call that takes long prints one line to
-    `sys.stderr`.
+    """Tells the user what a call is doing and how far it is, as a context manager. A
+    progress meter of Diffrax shows the share of samples that are done. Without a meter, a
+    call that takes long prints one line to `sys.stderr`.
 
+    - `caller`: the name of the function that the user called.
     - `advice`: the arguments of `caller` for a quick first look.
     """
 
@@ -30,17 +31,16 @@ class Progress:
         self._stage = "tracing"
         self._share = 0.0
         self._begin = time.monotonic()
-        # The main thread may be compiling, which it does not interrupt for a look at the
-        # clock.
+        # A thread of its own looks at the clock, since the main thread may be compiling.
         self._timer = threading.Timer(_SECONDS_OF_SILENCE, self._tell)
         self._timer.daemon = True
 
     def stage(self, name: str) -> None:
-        """Says what comes next, such as `sampling`."""
+        """Takes note of what the call does next, such as `sampling`."""
         self._stage = name
 
     def step(self, share: float) -> None:
-        """Says which share of the samples is done, from 0 to 1."""
+        """Takes note of the share of the samples that are done, from 0 to 1."""
         self._share = share
         self._meter_state = self._meter.step(self._meter_state, np.asarray(share))
 

@@ -33,8 +33,8 @@ from .sampling import MOST_SAMPLES, Samples, SamplingPlan
 
 
 class Kept:
-    """Keeps the estimate so far. As a context manager it raises an `ExpectationInterrupted`
-    that holds it, in place of a `KeyboardInterrupt` anywhere within.
+    """Keeps the estimate so far. As a context manager it turns a `KeyboardInterrupt` within
+    its block into an `ExpectationInterrupted` that holds this estimate.
 
     - `estimate`: the estimate after the last batch; `None` before the first.
     """
@@ -60,13 +60,15 @@ def run(
     kept: Kept | None = None,
     **fields: Any,
 ) -> Expectation:
-    """The estimate from the samples of a plan, which continues `start`, or without it
-    begins with sample number `first`. With a tolerance `tol` it may end before all samples
-    of the plan. The result does not depend on the number of devices. `kept`, if there is
-    one, gets the estimate after each batch, for the case of an interrupt. `fields` are
-    further fields of the result."""
-    # The numbers of the first sample of all, of the first that is not in the estimate yet,
-    # and one past the last.
+    """The estimate from the samples of a plan. The result does not depend on the number of
+    devices.
+
+    - `start`: an estimate to continue. Without it, samples begin with number `first`.
+    - `tol`: the tolerance, with which fewer samples may be taken than the plan has.
+    - `kept`: gets the estimate after each batch, for the case of an interrupt.
+    - `fields`: further fields of the result."""
+    # Samples have the numbers `begin` to `end - 1`. Those before `next_sample` are in the
+    # estimate.
     begin = first if start is None else start.moments[0].begin
     next_sample = first if start is None else start.moments[-1].end
     end = begin + plan.num_samples
@@ -97,9 +99,8 @@ def run(
         kept.estimate = estimate
 
     def needs_no_more_samples() -> bool:
-        """Whether there are enough samples for the tolerance, or more would not help:
-        because the error of the steps, or of failed paths, is too large beside that of
-        sampling."""
+        """Whether there are enough samples for the tolerance, or more samples would not
+        help, because the error of the steps or of failed paths is too large."""
         least = plan.least_beside_steps if tol is None else plan.least_samples
         if least is None or estimate.num_samples < least:
             return False
@@ -110,19 +111,20 @@ def run(
     batches = _Batches(plan, key, devices)
     firsts = iter(range(next_sample, end, batches.size * len(devices)))
 
-    def started_batch() -> Callable[[], list[BatchMoments]] | None:
-        """The next batch, if there is one and it is needed."""
+    def start_batch() -> Callable[[], list[BatchMoments]] | None:
+        """Starts the next batch. Returns the function that waits for its moments on each
+        device, or `None` if no batch is left or needed."""
         first_of_batch = None if needs_no_more_samples() else next(firsts, None)
         return None if first_of_batch is None else batches.start(first_of_batch, end)
 
-    batch = started_batch()
-    while batch is not None:
+    moments_of_batch = start_batch()
+    while moments_of_batch is not None:
         # Batches are started one ahead: while a batch is being computed, the one before it
         # is added to the estimate.
-        batch_ahead = started_batch()
-        for device_moments in batch():
-            # The moments of each device are a batch of their own: where to stop does not
-            # depend on how many devices there are.
+        moments_ahead = start_batch()
+        for device_moments in moments_of_batch():
+            # Samples are counted device by device, so that their number at the end does not
+            # depend on the number of devices.
             if next_sample == end or needs_no_more_samples():
                 break
             batch_begin = next_sample
@@ -134,7 +136,7 @@ def run(
         if progress is not None:
             share = (next_sample - begin) / plan.num_samples
             progress.step(max(share, share_of_needed(estimate, tol)))
-        batch = batch_ahead
+        moments_of_batch = moments_ahead
     if tol is not None:
         has_enough = estimate.num_samples >= plan.least_samples
         tol_reached = has_enough and is_reached(estimate, tol)
@@ -146,25 +148,25 @@ def run(
 class _Batches:
     """The batches of a plan, in each of which every device takes `size` samples.
 
-    Steps are first solved by sweeps alone: Newton's method would take a third of the time
-    to compile an implicit step, and few paths need it. Once a path fails, its batch is
-    computed again with Newton's method, which also takes part in all later batches."""
+    Implicit steps are first solved by the sweeps of `PicardNewton` alone. Few paths need
+    its Newton's method, which would be a third of the time to compile a step. Once a path
+    fails, its batch is computed again with Newton's method, and so are all later batches.
+    """
 
     def __init__(self, plan: SamplingPlan, key: PRNGKeyArray, devices: Devices):
         self.size = min(plan.batch_size, plan.num_samples)
         self._key_data = np.asarray(jr.key_data(key))
         self._key_impl = jr.key_impl(key)
         samplers = [plan.sampler]
-        # `simulate_paths` solves the steps before the sampler is called.
-        if plan.simulate_paths is None and _has_newton(plan.sampler):
+        solvers = [problem.solver for problem in parts_of(Problem, plan.sampler)]
+        # With `simulate_paths`, the steps are solved before the sampler is called.
+        if plan.simulate_paths is None and any(map(has_newton, solvers)):
             samplers = [_by_sweeps_alone(plan.sampler), plan.sampler]
-        # The last one is for paths that fail with the first one.
+        # The first sampler takes all samples until a path fails, and then the last one.
         self._samplers = [*map(_for_all_processes, samplers)]
         self._simulate_paths = plan.simulate_paths
         self._devices = devices
-        self._batch_moments: Any = (
-            quick_batch_moments if plan.is_quick else batch_moments
-        )
+        self._program: Any = quick_batch_moments if plan.is_quick else batch_moments
         self._mesh = Mesh(np.array(devices), ("samples",))
 
     def start(self, first: int, end: int) -> Callable[[], list[BatchMoments]]:
@@ -175,16 +177,16 @@ class _Batches:
         low_high = np.array([first & 0xFFFFFFFF, first >> 32], np.uint32)
         num_wanted = np.array(min(self.size * num_devices, end - first), np.int32)
         if num_devices == 1:
-            on_device = jax.device_put((low_high, num_wanted), self._devices[0])
-            low_high, num_wanted = on_device
+            device = self._devices[0]
+            low_high, num_wanted = jax.device_put((low_high, num_wanted), device)
         sampler = self._samplers[0]
         may_be_repeated = len(self._samplers) > 1
         if self._simulate_paths is not None:
-            # Not `jtu.Partial(sampler, paths)`: the function of a `Partial` is static, so
-            # with arrays in it, as in the sampler, JAX would compile for each batch.
+            # Not `jtu.Partial(sampler, paths)`: JAX takes the function of a `Partial` as
+            # static, so it would compile anew for the arrays in the sampler of each batch.
             paths = self._simulate_paths(first, self.size)
             sampler = jtu.Partial(_samples_of_paths, sampler, paths)
-        moments = self._batch_moments(
+        moments = self._program(
             sampler,
             self._key_data,
             self._key_impl,
@@ -195,7 +197,7 @@ class _Batches:
         )
 
         def moments_of_devices() -> list[BatchMoments]:
-            # The moments are traced if a function closes over traced values.
+            # The moments are traced if a function of the user closes over traced values.
             check_untraced("`expectation` or `monte_carlo`", moments)
             on_host = jax.device_get(moments)
             if may_be_repeated and np.any(on_host.any_failed):
@@ -208,14 +210,9 @@ class _Batches:
         return moments_of_devices
 
 
-def _has_newton(sampler: Callable[..., Samples]) -> bool:
-    """Whether Newton's method may solve steps of the paths that a sampler simulates."""
-    return any(has_newton(problem.solver) for problem in parts_of(Problem, sampler))
-
-
 def _by_sweeps_alone(sampler: Callable[..., Samples]) -> Callable[..., Samples]:
-    """The sampler without Newton's method. Solvers within a user's own function, which
-    reports its failures by itself, stay as they are."""
+    """The sampler without Newton's method. Solvers that a function of the user calls, as
+    for `monte_carlo`, stay as they are."""
 
     def by_sweeps_alone(problem: Problem) -> Problem:
         return dataclasses.replace(problem, solver=without_newton(problem.solver))
@@ -227,16 +224,16 @@ def _for_all_processes(sampler: Callable[..., Samples]) -> Callable[..., Samples
     """The sampler itself, or for several processes a function that captures it."""
     if jax.process_count() == 1:
         return sampler
-    # The arrays in a sampler are arguments of a program, which would have to be placed on
-    # the devices of all processes. In a function they are constants of the program, which
-    # all processes have alike.
+    # The arrays in a sampler would be arguments of the program, and have to be placed on
+    # the devices of all processes. Captured by a function, they are constants of the
+    # program, the same in all processes.
     return lambda keys: sampler(keys)
 
 
 def _samples_of_paths(
     sampler: Callable, paths: PyTree, keys: Key[Array, " n"]
 ) -> Samples:
-    """The samples from paths that were computed outside JAX."""
+    """The samples that a sampler makes of paths that were computed outside JAX."""
     return sampler(paths, keys)
 
 

@@ -20,11 +20,11 @@ MOST_SAMPLES = 2**63
 
 
 class Averaged(NamedTuple):
-    """What is averaged of samples: the value of each, whose mean is the estimate, and what
-    else some samplings know of it. Each field is an array whose last axis is that of all
-    numbers of `phi`, or `None`.
+    """What is averaged over samples: their values, and what else some samplings know of
+    them. Each field is an array whose last axis is that of all numbers of `phi`, or `None`
+    if the sampling does not have it.
 
-    - `value`: the value of a sample.
+    - `value`: the value of a sample. The mean of the values is the estimate.
     - `heaviness`: for a replicate of many paths, the `r` of `Expectation.std_error` over
         these paths, which measures how heavy their tails are.
     - `largest`: for a replicate, the largest deviation of one of its paths from its mean.
@@ -56,8 +56,8 @@ class Samples(eqx.Module):
 
     - `averaged`: their values, with axes for combinations of levels, for samples and for
         all numbers of `phi`.
-    - `good`: which samples are good.
-    - `num_failed`: how many paths failed in each, on each level.
+    - `good`: which samples count in the mean.
+    - `num_failed`: how many paths failed in each sample, on each level.
     - `also_failed`: which samples have a path that failed, but is not counted; `None` if
         there are none.
     """
@@ -69,11 +69,11 @@ class Samples(eqx.Module):
 
 
 class Outputs(NamedTuple):
-    """The numbers that are averaged: fields of an `Expectation`.
+    """What the averaged numbers are, as fields of an `Expectation`.
 
-    - `layout`: how they make PyTrees like `phi`.
+    - `layout`: how the numbers make PyTrees like `phi`.
     - `levels`: the number of levels.
-    - `dtype`: the dtype in which they are computed.
+    - `dtype`: the dtype in which the numbers are computed.
     """
 
     layout: Layout
@@ -82,7 +82,7 @@ class Outputs(NamedTuple):
 
     @staticmethod
     def of(problem: Problem) -> "Outputs":
-        """The values of the `phi` of a problem."""
+        """The outputs that are the values of the `phi` of a problem."""
         levels = len(problem.levels.h)
         return Outputs(problem.layout, levels, str(problem.dtype_of_values))
 
@@ -97,17 +97,17 @@ class SamplingPlan(NamedTuple):
     - `paths_per_sample`: the number of paths in a sample, on each level.
     - `least_samples`: the fewest samples whose variance is estimated well enough to stop.
     - `least_beside_steps`: the fewest samples after which an estimate without a tolerance
-        ends if its sampling error is a small part of that of the steps; `None` if it does
-        not.
+        may end because its sampling error is a small part of the error of the steps; `None`
+        if it always takes all samples.
     - `reason`: why this sampling was chosen, for the result.
-    - `remainder`: the largest fraction of a standard error that a control variate leaves of
-        it, by a trial.
-    - `is_quick`: whether the samples take less time than compiling their program, which is
-        then compiled for speed of compilation.
+    - `remainder`: the fraction of the standard error that a control variate leaves, by a
+        trial; the largest over all numbers of `phi`.
+    - `is_quick`: whether the samples take less time than compiling their program. The
+        program is then compiled quickly, with slower code.
     - `simulate_paths`: for paths computed outside JAX, maps the number of the first sample
         and the number of samples to an argument that the sampler takes before the keys.
     - `with_halved_steps`: makes the plan with halved steps on all levels, whose samples
-        need no other program; `None` if that would take long.
+        have the same program; `None` if to make it would take long.
     """
 
     sampler: Callable[..., Samples]
@@ -125,14 +125,14 @@ class SamplingPlan(NamedTuple):
 
 
 class AbstractSampling(eqx.Module):
-    """How the samples of an expectation are taken: the public classes."""
+    """How the samples of an expectation are taken. The public classes are subclasses."""
 
     @abc.abstractmethod
     def prepare(
         self, problem: Problem, key: PRNGKeyArray, devices: Devices
     ) -> SamplingPlan:
-        """The plan for a problem, made with trials that draw from `key`. Raises a
-        `ValueError` for a problem that it cannot sample."""
+        """The plan for a problem. Trials for it draw from `key`. Raises a `ValueError` for
+        a problem that this sampling cannot take."""
 
 
 # The samplings whose estimates can be read from files, by the names of their classes.

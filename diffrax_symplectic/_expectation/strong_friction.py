@@ -1,4 +1,8 @@
-"""Whether steps are too long for the friction of Langevin terms, where paths start."""
+"""Whether steps are too long for the friction of Langevin terms, in the state in which
+paths start.
+
+A rate of decay is compared with the length of a step by its product with `dt0`.
+"""
 
 import functools as ft
 
@@ -37,34 +41,38 @@ from .linear_maps import largest_growth, linearized
 from .long_steps import drift_frequencies
 
 
-# With a flow, a mode relaxes too slowly if it turns by more than this in a step, and the
-# rate of its friction times the step is more than this, too. Its position then changes
-# sign in each step.
+# A splitting with a flow relaxes a mode too slowly if both the angle by which the mode
+# turns in a step, and its rate of friction times the step, are more than this. The position
+# then changes its sign in each step.
 _MOST_BY_FLOW = 2.0
-# So many applications of power iteration find a direction, and as many more measure it.
+# This many applications of power iteration find a direction, and as many more measure its
+# growth.
 _ITERATIONS = 15
-# Where friction changes along a step by more than the first number, and over `dt0` damps
-# momenta at more than the second, two levels may be wrong together. Measured for the mean
-# of q^2 of a free particle after 40 steps, with a friction tensor that turns with the
-# position, G = R(k q) diag(a, b) R(k q)^T. Two levels leave their bar, by two standard
-# errors, from a change of 0.5 on with a h = 20 and b = a / 100; from 0.87 with b = a / 10;
-# from 1.2 with a h = 5 and a h = 2; and with a h = 1 at k h v = 10, but not at 5.
+# Two levels may agree on a wrong mean if the friction changes along a step by more than the
+# first number, relative to itself, and its rate times `dt0` is more than the second.
+# Measured for the mean of q^2 of a free particle after 40 steps, with a friction tensor
+# that turns with the position, G = R(k q) diag(a, b) R(k q)^T. Two levels leave their error
+# bar, by two standard errors, from a change of 0.5 on with a h = 20 and b = a / 100; from
+# 0.87 with b = a / 10; from 1.2 with a h = 5 and a h = 2; and with a h = 1 at k h v = 10,
+# but not at 5.
 _MOST_CHANGE = 0.5
 _HARDLY_DAMPED = 1.0
-# At how many velocities the change is measured, and after how many steps of the bath, each
-# twice as long as the one before, momenta count as thermal: all that decay at more than
-# 2^-16 of the largest rate have forgotten where they began.
+# The change is measured at this many velocities.
 _VELOCITIES = 16
+# Momenta count as thermal after this many steps of the bath, each twice as long as the one
+# before: all momenta that decay at more than 2^-16 of the largest rate have then forgotten
+# where they began.
 _DOUBLINGS = 16
 # Two directions count as parallel if the cosine of the angle between them is above this.
 _COSINE_OF_PARALLEL = 0.9
 
 
 def unresolved_friction(problem: Problem, dt0: float) -> str | None:
-    """What is wrong with steps of `dt0` for the friction at the start of a path, as a
-    sentence; `None` if nothing is, or for solvers of others. Two levels need not show it:
-    momenta may be wrong by about the same factor on both, and positions may rest on both.
-    """
+    """A warning if steps of `dt0` do not resolve the friction where paths start; `None` if
+    they do, or for solvers of other packages.
+
+    Two levels need not show unresolved friction: momenta may be wrong by about the same
+    factor on both levels, and positions may rest on both."""
     solver = problem.solver
     if not isinstance(solver, AbstractSymplecticSolver):
         return None
@@ -73,64 +81,80 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
     drift, friction, noise = split_friction(problem.terms)
     if not noise:
         return None
-    beginning = f"Steps of `dt0={dt0:g}` do not resolve"
-    name = type(solver).__name__
-    # In units of 1 / `dt0`; `None` if the solver takes every friction.
+    # The largest rate of friction times `dt0` that the solver takes; `None` for any rate.
     most_friction = None if solver.record is None else solver.record.most_friction
     if not friction:
-        # Friction that is a part of the drift, such as the loss of a wave. Only a state
-        # that decays hardly oscillating counts.
         if not drift or most_friction is None:
             return None
-        decay = float(_decay(problem)) * dt0
-        if not decay > most_friction:
-            return None
-        return (
-            f"{beginning} a decay: where paths start, the drift damps the state at a rate "
-            f"of {decay:.3g} / `dt0`, and `{name}` has the right size of fluctuations only "
-            f"up to {most_friction:g} / `dt0`. Pass a smaller `dt0`."
-        )
+        return _unresolved_decay(problem, dt0, most_friction)
     has_flow = isinstance(solver, AbstractLangevinSplitting) and solver.has_flow
     may_change = _may_change(problem)
     if most_friction is None and not has_flow and not may_change:
         return None
-    friction_of_step = float(_friction_rate(problem)) * dt0
-    if most_friction is not None and friction_of_step > most_friction:
+    damping = float(_friction_rate(problem)) * dt0
+    if most_friction is not None and damping > most_friction:
         return (
-            f"{beginning} the friction: momenta decay at a rate of "
-            f"{friction_of_step:.3g} / `dt0` where paths start, and `{name}` has the right "
-            f"temperature only up to {most_friction:g} / `dt0`. Pass a smaller `dt0`, or "
-            "`BAOAB()`, which takes every friction."
+            f"Steps of `dt0={dt0:g}` do not resolve the friction: momenta decay at a rate "
+            f"of {damping:.3g} / `dt0` where paths start, and `{type(solver).__name__}` "
+            f"has the right temperature only up to {most_friction:g} / `dt0`. Pass a "
+            "smaller `dt0`, or `BAOAB()`, which takes every friction."
         )
-    angle = 0.0
-    if has_flow and friction_of_step > _MOST_BY_FLOW:
-        (frequency,) = drift_frequencies(problem, np.zeros(1, problem.dtype))
-        angle = float(frequency) * dt0
-    if angle > _MOST_BY_FLOW:
-        return (
-            f"{beginning} a vibration with strong friction, omega h = {angle:.3g} where "
-            f"paths start: with a `flow`, `{name}` keeps its stationary law, but takes its "
-            "position to the other side in each step, and relaxes far too slowly. Pass "
-            "`dt0` below 2 / omega, and `BAOAB()` if masses are constant."
-        )
-    if not may_change or not friction_of_step > _HARDLY_DAMPED:
+    message = None
+    if has_flow and damping > _MOST_BY_FLOW:
+        message = _unresolved_vibration(problem, dt0)
+    if message is None and may_change and damping > _HARDLY_DAMPED:
+        message = _unresolved_change(problem, dt0, damping)
+    return message
+
+
+def _unresolved_decay(problem: Problem, dt0: float, most_friction: float) -> str | None:
+    """A warning if the drift damps the state too fast for the solver, as the loss of a wave
+    does. `most_friction` is that of `Record`."""
+    decay = float(_decay(problem)) * dt0
+    if not decay > most_friction:
         return None
+    return (
+        f"Steps of `dt0={dt0:g}` do not resolve a decay: where paths start, the drift "
+        f"damps the state at a rate of {decay:.3g} / `dt0`, and "
+        f"`{type(problem.solver).__name__}` has the right size of fluctuations only up to "
+        f"{most_friction:g} / `dt0`. Pass a smaller `dt0`."
+    )
+
+
+def _unresolved_vibration(problem: Problem, dt0: float) -> str | None:
+    """A warning if the flow of a splitting turns a mode too far, for strong friction."""
+    (frequency,) = drift_frequencies(problem, np.zeros(1, problem.dtype))
+    angle = float(frequency) * dt0
+    if not angle > _MOST_BY_FLOW:
+        return None
+    return (
+        f"Steps of `dt0={dt0:g}` do not resolve a vibration with strong friction, omega h "
+        f"= {angle:.3g} where paths start: with a `flow`, "
+        f"`{type(problem.solver).__name__}` keeps its stationary law, but takes its "
+        "position to the other side in each step, and relaxes far too slowly. Pass `dt0` "
+        "below 2 / omega, and `BAOAB()` if masses are constant."
+    )
+
+
+def _unresolved_change(problem: Problem, dt0: float, damping: float) -> str | None:
+    """A warning if the friction changes too much along a step. `damping` is its rate times
+    `dt0`."""
     change = float(_change_along_step(problem))
     if not change > _MOST_CHANGE:
         return None
     return (
-        f"{beginning} how the friction changes with positions: by {change:.0%} along one "
-        "step from where paths start, at the speed of the heat bath, while momenta decay "
-        f"at a rate of {friction_of_step:.3g} / `dt0`. Two levels may agree on a wrong "
-        "mean, as of a diffusion. Pass a smaller `dt0`, in which the friction changes, or "
-        "turns, by a small part."
+        f"Steps of `dt0={dt0:g}` do not resolve how the friction changes with positions: "
+        f"by {change:.0%} along one step from where paths start, at the speed of the heat "
+        f"bath, while momenta decay at a rate of {damping:.3g} / `dt0`. Two levels may "
+        "agree on a wrong mean, as of a diffusion. Pass a smaller `dt0`, in which the "
+        "friction changes, or turns, by a small part."
     )
 
 
 @once_for_each_signature
 def _may_change(problem: Problem) -> bool:
-    """Whether the friction reads the positions. (Forces at several positions might be equal
-    by chance.)"""
+    """Whether the friction may change with the positions: whether its program reads them.
+    (Forces at several positions might be equal by chance.)"""
     _, friction, _ = split_friction(problem.terms)
     force = ft.partial(_friction_force, problem, friction)
     p0, q0 = problem.y0
@@ -141,7 +165,8 @@ def _may_change(problem: Problem) -> bool:
 def _friction_force(
     problem: Problem, friction: Terms, q: PyTree[Array], velocity: PyTree[Array]
 ) -> Float[Array, " n"]:
-    """`-G v` at the positions `q`, as one vector."""
+    """The force `-G(q) v` of the friction at the positions `q` and the velocity `v`, as one
+    vector."""
     fields = [field_of(term) for term in friction]
     forces = [field.force(problem.t0, q, problem.args, velocity) for field in fields]
     return jfu.ravel_pytree(tree_sum(forces))[0]
@@ -149,9 +174,9 @@ def _friction_force(
 
 @ft.partial(compiled, quickly=True)
 def _change_along_step(problem: Problem) -> Float[Array, ""]:
-    """How much the friction changes with positions along the first step, relative to the
-    friction where paths start. For a few thermal velocities, the force of the friction on
-    the same velocity is compared before and after the step, in the root mean square."""
+    """How much the friction changes along the first step because positions change, relative
+    to the friction where paths start. This is the change of the friction's force at the
+    same velocity, in the root mean square over a few thermal velocities."""
     drift, friction, noise = split_friction(problem.terms)
     bath_noise = tuple(term for term in noise if isinstance(unwrapped(term), BathNoise))
     p0, q0 = problem.y0
@@ -161,8 +186,9 @@ def _change_along_step(problem: Problem) -> Float[Array, ""]:
 
     def thermal_momentum(key: PRNGKeyArray) -> PyTree[Array]:
         """A momentum with the law of the bath, by steps of the bath alone, which keep this
-        law whatever their length. The first, short ones draw the parts of the momentum that
-        decay fast, and the last, long ones those that decay slowly."""
+        law whatever their length. The first steps are short, and draw the parts of the
+        momentum that decay fast. The last steps are long, and draw the parts that decay
+        slowly."""
 
         def step_of_bath(number: Array, p: PyTree[Array]) -> PyTree[Array]:
             h = dt0 * 2.0**number
@@ -177,7 +203,8 @@ def _change_along_step(problem: Problem) -> Float[Array, ""]:
         return lax.fori_loop(0, _DOUBLINGS, step_of_bath, p0)
 
     def squared_forces(key: PRNGKeyArray) -> tuple[Array, Array]:
-        """The squares of the friction's force at the start, and of its change."""
+        """The squares of the friction's force at the start of the step, and of the change
+        of this force along the step."""
         p = thermal_momentum(key)
         _, velocity = rate(drift, problem.t0, (p, q0), problem.args)
         q1 = jtu.tree_map(lambda q, v: q + dt0 * v, q0, velocity)
@@ -192,7 +219,7 @@ def _change_along_step(problem: Problem) -> Float[Array, ""]:
 
 @ft.partial(compiled, quickly=True)
 def _friction_rate(problem: Problem) -> Float[Array, ""]:
-    """The largest rate at which friction takes away a momentum at the start."""
+    """The largest rate at which friction damps a momentum where paths start."""
     _, friction, _ = split_friction(problem.terms)
     p0, q0 = problem.y0
 
@@ -216,9 +243,10 @@ def _decay(problem: Problem) -> Float[Array, ""]:
     direction = largest_growth(derivative, flat_y0, _ITERATIONS).direction
     once = derivative(direction)
     twice = derivative(once)
-    # The derivative of a decay turns its direction around, and applied twice back again.
-    # That of an oscillation may also turn it around, where positions and momenta differ
-    # much in size. But applied twice it is -omega^2, which does not turn it back.
+    # For a decay, the derivative turns the direction around, and applied twice turns it
+    # back. For an oscillation, the derivative may also turn the direction around, if
+    # positions and momenta differ much in size. But applied twice it multiplies by
+    # -omega^2, which does not turn the direction back.
     turns_around = _cosine(direction, once) < -_COSINE_OF_PARALLEL
     turns_back = _cosine(direction, twice) > _COSINE_OF_PARALLEL
     # Where the derivative is zero, cosines are NaN, and both comparisons false.
