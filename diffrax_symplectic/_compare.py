@@ -1,4 +1,4 @@
-"""Comparison of solvers on one system: speed against accuracy."""
+"""`compare_solvers`: the speed and the accuracy of solvers on one system."""
 
 import dataclasses
 import functools as ft
@@ -43,11 +43,11 @@ from ._terms import (
 
 
 # The number of steps of the reference in the smallest compared step. With order 1/2 the
-# error of the reference is then 8^(-1/2), about a third, of the error that is measured;
-# with any higher order it is less.
+# error of the reference is then 8^(-1/2), about a third, of the error that is measured.
+# With any higher order it is less.
 _REFERENCE_STEPS = 8
-# The number of the batch of paths along which the reference is solved. Strong errors of all
-# solvers are measured along the same paths.
+# The number of the batch of paths for which the reference is solved. Strong errors of all
+# solvers are measured along these paths.
 _COMMON_BATCH = 0
 # A quotient of times counts as a whole number if it differs from one by less than this.
 _TIME_ROUNDING = 1e-6
@@ -64,16 +64,8 @@ class PathResults(NamedTuple):
     okay: Bool[Array, " num_paths"]
 
 
-# Solves for the paths with these keys, by this step size.
+# Solves for a batch of paths. The arguments are their random keys, and the step size.
 _SolveBatch: TypeAlias = Callable[[Key[Array, " num_paths"], Array], PathResults]
-
-
-class _MeasuredError(NamedTuple):
-    """An error with its standard error, and the number of paths that it leaves out."""
-
-    error: float
-    std_error: float
-    num_failed: int
 
 
 class ComparedStep(NamedTuple):
@@ -110,7 +102,7 @@ class Comparison:
 
     def __str__(self) -> str:
         title = f"{self.kind} error"
-        # The columns of the heading are as wide as those of the rows below.
+        # The rows below have columns of the same widths.
         lines = [f"{'solver':20} {'dt':>9} {title:>22} {'seconds per path':>17}"]
         for step in self.steps:
             failed = f"  {step.num_failed} failed" if step.num_failed else ""
@@ -136,7 +128,7 @@ class Comparison:
 
         if axes is None:
             _, axes = plt.subplots(layout="constrained")
-        # One name for each solver, in the order of `steps`.
+        # A dictionary keeps each name once, in the order of `steps`.
         for solver_name in dict.fromkeys(step.solver for step in self.steps):
             steps = [step for step in self.steps if step.solver == solver_name]
             axes.errorbar(
@@ -225,57 +217,55 @@ def compare_solvers(
         _check_scalar(phi, t1, y0, args)
         phi = traced(phi, jnp.asarray(t1, float), y0, args)
     terms = with_programs(terms, t0, y0, args)
-    is_strong = want == "strong"
     reference_dt = min(dts) / _REFERENCE_STEPS
     solve_along = ft.partial(_solve_batch, terms, t0, t1, y0, args, phi)
 
     def keys(batch_number: int) -> Key[Array, " num_paths"]:
         return jr.split(jr.fold_in(key, batch_number), num_paths)
 
-    def solve_with_own_path(solver: diffrax.AbstractSolver) -> _SolveBatch:
+    def solve_along_own_path(solver: diffrax.AbstractSolver) -> _SolveBatch:
         return solve_along(solver, ft.partial(own_path, solver, want))
 
     def solve_to_compare(solver: diffrax.AbstractSolver) -> _SolveBatch:
         # Strong errors need a common Brownian motion, which not all solvers can use.
-        if is_strong:
+        if want == "strong":
             return solve_along(solver, ft.partial(common_path, solver, reference_dt))
-        return solve_with_own_path(solver)
+        return solve_along_own_path(solver)
 
     common_keys = keys(_COMMON_BATCH)
+    # Step sizes are arrays: for a Python number the program would compile anew.
     exact = solve_to_compare(reference)(common_keys, jnp.asarray(reference_dt))
     # The results are traced if a function of the user closes over traced values.
     check_untraced("`compare_solvers`", exact)
     steps = []
     refused = {}
     for solver in solvers:
+        name = repr(solver)
         compared_solve = solve_to_compare(solver)
-        try:
-            # Refusals are errors while tracing, so that nothing need be compiled for them.
-            eqx.filter_eval_shape(compared_solve, common_keys, jnp.asarray(dts[0]))
-        except ValueError as error:
-            refused[repr(solver)] = str(error).splitlines()[0]
+        refusal = _refusal(compared_solve, common_keys, jnp.asarray(dts[0]))
+        if refusal is not None:
+            refused[name] = refusal
             continue
-        # Times are measured with the solver's own path, since a common one may take longer.
-        timed_solve = solve_with_own_path(solver) if is_strong else compared_solve
+        # Times are measured along the solver's own path, since a common one may take
+        # longer. Weak errors are measured along the own path, too.
+        timed_solve = compared_solve if want == "weak" else solve_along_own_path(solver)
         # The first call compiles, and is not timed.
         jax.block_until_ready(timed_solve(keys(1), jnp.asarray(dts[0])))
         # Each step size has a batch of its own, since weak errors are from independent
-        # paths. (Strong ones are measured along the common batch.)
+        # paths.
         for batch_number, dt in enumerate(dts, start=1):
             keys_of_batch = keys(batch_number)
-            # With a number in place of an array the program would compile anew.
             dt_array = jnp.asarray(dt)
             begin = time.perf_counter()
             results = jax.block_until_ready(timed_solve(keys_of_batch, dt_array))
             seconds = (time.perf_counter() - begin) / num_paths
-            if is_strong:
-                measured = strong_error(compared_solve(common_keys, dt_array), exact)
+            if want == "strong":
+                # Strong errors are measured along the paths of the reference.
+                along_reference = compared_solve(common_keys, dt_array)
+                error, std_error, num_failed = strong_error(along_reference, exact)
             else:
-                measured = weak_error(results, exact)
-            step = ComparedStep(
-                solver=repr(solver), dt=dt, seconds=seconds, **measured._asdict()
-            )
-            steps.append(step)
+                error, std_error, num_failed = weak_error(results, exact)
+            steps.append(ComparedStep(name, dt, error, std_error, seconds, num_failed))
     return Comparison(want, tuple(steps), refused)
 
 
@@ -289,18 +279,18 @@ def _solve_batch(
     solver: diffrax.AbstractSolver,
     make_path: Callable,
 ) -> _SolveBatch:
-    """The compiled function that solves along the paths of `make_path`, as for
-    `with_paths`."""
+    """A compiled function that solves for a batch of paths by one solver. Brownian paths
+    from `make_path(shape, key)` take the place of those of the terms (see `with_paths`)."""
     solver = with_programs(solver, t0, y0, args)
-    # Terms with equal numbers get the same path, since they shared one before.
+    # Terms that share a Brownian motion have equal numbers, and get the same new path.
     numbers = motion_numbers(random_paths(terms))
 
     @eqx.filter_jit
     @lapack_in_turn
     @ft.partial(jax.vmap, in_axes=(0, None))
     def results(key: PRNGKeyArray, dt: Array) -> PathResults:
-        # Increments are not truncated: paths fail where a step has no solution, and are
-        # counted.
+        # Increments are not truncated. So a step may have no solution, and the path fails,
+        # and is counted as failed.
         own_terms = with_paths(make_path, numbers, terms, key)
         check_stratonovich(own_terms, solver, t0, y0, args)
         sol = diffrax.diffeqsolve(
@@ -314,43 +304,57 @@ def _solve_batch(
     return results
 
 
-def strong_error(compared: PathResults, exact: PathResults) -> _MeasuredError:
-    """The root mean square of the difference over the paths that both solvers finish, and
-    the number of paths that either does not finish."""
+def _refusal(
+    solve_batch: _SolveBatch, keys: Key[Array, " num_paths"], dt: Array
+) -> str | None:
+    """Why a solver does not accept the terms; `None` if it does."""
+    # Solvers refuse terms by errors while tracing, so nothing need be compiled.
+    try:
+        eqx.filter_eval_shape(solve_batch, keys, dt)
+    except ValueError as error:
+        return str(error).splitlines()[0]
+    return None
+
+
+def strong_error(compared: PathResults, exact: PathResults) -> tuple[float, float, int]:
+    """The root mean square of the difference between two solutions along the same paths,
+    its standard error, and the number of failed paths: those that one of the solvers does
+    not finish, which are excluded."""
     okay = np.asarray(compared.okay & exact.okay)
 
     def squared_differences(y: Array, exact_y: Array) -> np.ndarray:
         return np.asarray(y - exact_y, np.float64).reshape(len(okay), -1) ** 2
 
-    # (paths, entries) for each leaf of the state
+    # For each leaf of the state: (paths, entries).
     leaves = jtu.tree_leaves(
         jtu.tree_map(squared_differences, compared.results, exact.results)
     )
     squares = np.concatenate(leaves, axis=1).sum(axis=1)
     mean_square, std_error_of_mean_square = _mean_and_std_error(squares, okay)
     root_mean_square = math.sqrt(mean_square)
-    # The derivative of the square root is 1 / (2 sqrt).
-    # If there is no difference at all, 0 / 0 makes the standard error NaN.
+    # The standard error of sqrt(x) is that of x, times the derivative 1 / (2 sqrt(x)). If
+    # there is no difference at all, 0 / 0 makes it NaN.
     with np.errstate(all="ignore"):
         std_error = np.divide(std_error_of_mean_square, 2 * root_mean_square)
-    return _MeasuredError(root_mean_square, float(std_error), int(np.sum(~okay)))
+    return root_mean_square, float(std_error), int(np.sum(~okay))
 
 
-def weak_error(compared: PathResults, exact: PathResults) -> _MeasuredError:
-    """The difference of the means, and the number of failed paths of the compared
-    solver."""
+def weak_error(compared: PathResults, exact: PathResults) -> tuple[float, float, int]:
+    """The absolute difference between the means of two solutions along independent paths,
+    its standard error, and the number of failed paths of the compared solver."""
     mean, std_error = _mean_and_std_error(compared.results, compared.okay)
     exact_mean, exact_std_error = _mean_and_std_error(exact.results, exact.okay)
-    # Both means are from independent paths, so their variances add up.
+    # The variances of means from independent paths add up.
     std_error_of_difference = math.hypot(std_error, exact_std_error)
     num_failed = int(np.sum(~np.asarray(compared.okay)))
-    return _MeasuredError(abs(mean - exact_mean), std_error_of_difference, num_failed)
+    return abs(mean - exact_mean), std_error_of_difference, num_failed
 
 
 def _mean_and_std_error(values: Any, okay: Any) -> tuple[float, float]:
     """The mean of the values of paths that are `okay`, and its standard error."""
     with np.errstate(all="ignore"), warnings.catch_warnings():
-        # If no path is left, the mean is NaN, and the number of failures tells why.
+        # If no path is left, the mean is NaN without a warning, since the number of failed
+        # paths tells why.
         warnings.simplefilter("ignore", RuntimeWarning)
         okay_values = np.asarray(values, np.float64)[np.asarray(okay)]
         std_error = np.std(okay_values) / np.sqrt(len(okay_values))
@@ -358,7 +362,8 @@ def _mean_and_std_error(values: Any, okay: Any) -> tuple[float, float]:
 
 
 def _check_solvers(solvers: Any, reference: Any) -> None:
-    """Raises a `ValueError` unless these are a list of solvers, and a solver."""
+    """Raises a `ValueError` unless `solvers` is a list of solvers, and `reference` is a
+    solver."""
     is_list = isinstance(solvers, Sequence) and not isinstance(solvers, str)
     if not is_list or len(solvers) == 0:
         raise ValueError(
@@ -383,8 +388,8 @@ def _check_scalar(phi: Any, t: RealScalarLike, y0: Y, args: Args) -> None:
 
 def _checked_dts(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
     """The step sizes `dts`, as Python numbers. Raises a `ValueError` unless each is
-    positive, divides the interval, and is a multiple of the smallest, whose increments add
-    up to those of all others."""
+    positive, divides the interval, and is a multiple of the smallest. (Brownian increments
+    over the smallest step are added up to those over longer steps.)"""
     if not t1 > t0:
         raise ValueError(f"`t1` must be after `t0`; got t0={t0!r} and t1={t1!r}.")
     if np.ndim(dts) != 1 or len(dts) == 0:
@@ -403,6 +408,6 @@ def _checked_dts(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
 
 
 def _is_whole(x: float) -> bool:
-    """Whether this quotient is a positive whole number, up to rounding."""
-    # Numbers up to a half would be rounded to zero.
+    """Whether `x` is a positive whole number, up to rounding."""
+    # `round` makes zero of numbers up to a half.
     return math.isfinite(x) and x > 0.5 and abs(x - round(x)) < _TIME_ROUNDING

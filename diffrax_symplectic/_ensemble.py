@@ -31,24 +31,24 @@ from ._solver import Want
 from ._terms import path_keys, which_are_shapes, with_keys
 
 
-# The number of entries of all states in a batch: enough to keep every core busy, in tens of
-# megabytes.
+# The number of entries of all states in a batch, for each engine on CPUs. So many keep
+# every core busy, and take tens of megabytes.
 _ENTRIES_OF_BATCH = {"jax": 2**17, "drjit": 2**20}
-# Accelerators need this many times as many entries.
+# On accelerators a batch has this many times as many entries.
 _FACTOR_ON_ACCELERATORS = 16
-# The fewest paths in a batch, however large their states are, so that batches are few.
+# The fewest paths in a batch. For large states, smaller batches would be too many.
 _FEWEST_PATHS = 256
 
 
 class Ensemble(eqx.Module):
     """The paths of [`diffrax_symplectic.ensemble`][].
 
-    - `ts`: the times.
+    - `ts`: the saved times.
     - `ys`: the states at these times, as NumPy arrays. The first axis is the path; if `ts`
         was passed, the second is the time. All states of a failed path are NaN.
     - `failed`: which paths failed.
     - `num_stragglers`: how many paths `engine="drjit"` handed back to JAX.
-    - `engine`: the engine that simulated them.
+    - `engine`: the engine that simulated the paths.
     """
 
     ts: Float[np.ndarray, " times"]
@@ -76,12 +76,14 @@ class Ensemble(eqx.Module):
         return y0, self._problem.with_args(own_args).args
 
     def _key_of(self, number: IntScalarLike) -> PRNGKeyArray:
-        return sample_key(self._key, *_words_of_number(number))
+        """The random key of path number `number`."""
+        return sample_key(self._key, *_high_and_low(number))
 
 
-def _words_of_number(number: IntScalarLike) -> tuple[ArrayLike, ArrayLike]:
-    """The upper and the lower 32 bits of the number of a path. Raises a `ValueError`
-    unless it is an integer that is not negative, as far as that is known."""
+def _high_and_low(number: IntScalarLike) -> tuple[ArrayLike, ArrayLike]:
+    """The high and the low 32 bits of the number of a path. Raises a `ValueError` unless
+    the number is an integer, and not negative. (The sign of traced numbers is not known.)
+    """
     is_scalar = eqx.is_array_like(number) and jnp.shape(number) == ()
     if not is_scalar or not jnp.issubdtype(jnp.result_type(number), jnp.integer):
         raise ValueError(
@@ -89,12 +91,12 @@ def _words_of_number(number: IntScalarLike) -> tuple[ArrayLike, ArrayLike]:
             "paths, batch over their numbers: `jax.vmap(paths.start)(numbers)`."
         )
     if not is_traced(number):
-        # Python's integers may have more than 32 bits, whatever those of JAX have.
+        # Python divides, since its integers may have more bits than those of JAX.
         high, low = divmod(whole_number("number", int(number), least=0), 2**32)
         return np.uint32(high), np.uint32(low)
-    traced = jnp.asarray(number)
+    traced_number = jnp.asarray(number)
     # If the integer type has 32 bits or fewer, XLA's shift by 32 gives zero, as it should.
-    return (traced >> 32).astype(jnp.uint32), traced.astype(jnp.uint32)
+    return (traced_number >> 32).astype(jnp.uint32), traced_number.astype(jnp.uint32)
 
 
 def ensemble(
@@ -134,18 +136,18 @@ def ensemble(
         print(q.shape, q.std(), paths.num_failed)
         ```
 
-    Path $i$ depends on `key` and $i$ only. `terms(i)` and `start(i)` of the result
-    reproduce it with `diffrax.diffeqsolve`. `y0` may draw a start for each path. Only the
-    returned arrays grow with the number of paths. For events along a path use
-    [`diffrax_symplectic.monte_carlo`][].
+    Path $i$ depends on `key` and $i$ only. With `terms(i)` and `start(i)` of the result,
+    `diffrax.diffeqsolve` gives the same path. `y0` may be a function that draws a start for
+    each path. With more paths, only the returned arrays take more memory. For events along
+    a path use [`diffrax_symplectic.monte_carlo`][].
 
     **Noise.** If `terms` hold a shape, the solver makes a path with Gaussian increments.
-    They are bounded for implicit solvers where the noise depends on the state, by a
-    [`diffrax_symplectic.TruncatedBrownianPath`][] that takes at most 0.04% of their
-    variance. (A warning says if one of yours takes more than 0.1%.) The discrete increments
-    of `want="weak"` take less time, and give the right means of smooth functions only.
-    Solvers with discrete increments only, such as [`diffrax_symplectic.AdditiveGauss`][],
-    need `want="weak"`.
+    For implicit solvers, the increments of noise that depends on the state are bounded by a
+    [`diffrax_symplectic.TruncatedBrownianPath`][], which takes at most 0.04% of their
+    variance. (You are warned if a truncated path of your own takes more than 0.1%.) The
+    discrete increments of `want="weak"` take less time, and give the right means of smooth
+    functions only. Solvers with discrete increments only, such as
+    [`diffrax_symplectic.AdditiveGauss`][], need `want="weak"`.
 
     **Engines.** `engine="drjit"` fuses all steps into one kernel, several times as fast;
     see [Large ensembles][large-ensembles]. `"jax"` is the default.
@@ -164,15 +166,15 @@ def ensemble(
     **Returns:** an [`diffrax_symplectic.Ensemble`][].
 
     **Raises:** what [`diffrax_symplectic.expectation`][] raises, and a `ValueError` if
-    `engine` or `want` is unknown, or if a solver with discrete increments alone would have
+    `engine` or `want` is unknown, or if a solver with discrete increments only would have
     to make a path and `want` is not `"weak"`. With `engine="drjit"`: a `ValueError` if the
     system uses an operation that cannot be replayed, its state has more than 256 entries,
     or a `PicardNewton` has another tolerance than rounding error, and an `ImportError` if
-    Dr.Jit or LLVM is missing. Warns if paths failed, if many are stragglers, and
-    if your own truncation takes more than 0.1% of the variance of increments.
+    Dr.Jit or LLVM is missing. Warns if paths failed, if Dr.Jit handed many paths back to
+    JAX, and if a truncated path of your own takes more than 0.1% of the variance of
+    increments.
     """
-    other_arguments = terms, t0, t1, dt0, y0, args
-    key = checked_key("ensemble", key, other_arguments)
+    key = checked_key("ensemble", key, (terms, t0, t1, dt0, y0, args))
     num_paths = whole_number("num_paths", num_paths)
     engine = "jax" if engine is None else engine
     if engine not in ENGINES:
@@ -181,40 +183,27 @@ def ensemble(
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
     with ShortTraceback():
         problem = Problem.of(
-            state_itself,
-            terms,
-            solver,
-            t0,
-            t1,
-            dt0,
-            y0,
-            args,
-            ts=[t1] if ts is None else ts,
-            levels=1,
-            want=want,
-            caller="ensemble",
-            key=key,
-        )
+            state_itself, terms, solver, t0, t1, dt0, y0, args,
+            ts=[t1] if ts is None else ts, levels=1, want=want, caller="ensemble", key=key,
+        )  # fmt: skip
     if want == "strong" and any(which_are_shapes(terms)):
         check_gaussian(solver)
     warn_of_truncation(problem.terms, float(dt0), stacklevel=2)
     num_times = problem.levels.saved_steps.size
     check_memory("num_paths", num_paths, num_times * problem.bytes_of_state)
     if batch_size is None:
-        entries_of_batch = _ENTRIES_OF_BATCH[engine]
-        if jax.default_backend() != "cpu":
-            entries_of_batch *= _FACTOR_ON_ACCELERATORS
-        batch_size = max(_FEWEST_PATHS, entries_of_batch // problem.num_components)
+        batch_size = _default_batch_size(problem, engine)
     batch_size = min(whole_number("batch_size", batch_size), num_paths)
     batches = []
     for first in range(0, num_paths, batch_size):
-        # JAX would compile anew for a last batch of another size.
+        # JAX would compile anew for a last batch of another size, so it simulates a whole
+        # batch, of which `_concatenated` drops the rest.
         num_left = num_paths - first
         size = batch_size if engine == "jax" else min(batch_size, num_left)
         sample_numbers = np.arange(first, first + size, dtype=np.uint64)
         batches.append(ENGINES[engine](problem, key, sample_numbers))
-    whole = _concatenated(batches, num_paths, at_end=ts is None)
-    num_failed = int(np.sum(whole.failed))
+    all_paths = _concatenated(batches, num_paths, at_end=ts is None)
+    num_failed = int(np.sum(all_paths.failed))
     if num_failed > 0:
         advice = advice_on_failures(problem)
         warnings.warn(
@@ -222,24 +211,32 @@ def ensemble(
             f"the others with `~failed`. {advice}",
             stacklevel=2,
         )
-    warn_of_stragglers(whole.num_stragglers, num_failed, num_paths, stacklevel=2)
-    # The times at which steps end. (Those in `ts` may differ from them by rounding.)
+    warn_of_stragglers(all_paths.num_stragglers, num_failed, num_paths, stacklevel=2)
+    # The times at which steps end. (The times in `ts` may differ from these by rounding.)
     saved_steps = np.asarray(problem.levels.saved_steps[0])
     saved_times = float(problem.t0) + saved_steps * float(problem.levels.h[0])
     return Ensemble(
         ts=saved_times,
-        ys=whole.y,
-        failed=whole.failed,
-        num_stragglers=whole.num_stragglers,
+        ys=all_paths.y,
+        failed=all_paths.failed,
+        num_stragglers=all_paths.num_stragglers,
         engine=engine,
         _problem=problem,
         _key=key,
     )
 
 
+def _default_batch_size(problem: Problem, engine: str) -> int:
+    """The number of paths that an engine simulates at once by default."""
+    num_entries = _ENTRIES_OF_BATCH[engine]
+    if jax.default_backend() != "cpu":
+        num_entries *= _FACTOR_ON_ACCELERATORS
+    return max(_FEWEST_PATHS, num_entries // problem.num_components)
+
+
 def _concatenated(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
-    """All batches as one, cut to this number of paths, with NaN for the states of failed
-    paths. Without the axis of times if the states were wanted `at_end` only."""
+    """The first `num_paths` paths of all batches as one batch, with NaN for the states of
+    failed paths. If the states were wanted `at_end` only, there is no axis of times."""
     failed = np.concatenate([batch.failed for batch in batches])[:num_paths]
 
     def concatenate(*leaves: np.ndarray) -> np.ndarray:

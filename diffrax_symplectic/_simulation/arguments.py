@@ -1,4 +1,5 @@
-"""Checks of the arguments of `expectation` and `ensemble`, before anything is solved."""
+"""Checks of the arguments of `expectation` and `ensemble`, before anything is solved, and
+the arguments in the form in which a `Problem` holds them."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -46,21 +47,24 @@ from .._terms import (
 # Times are given in decimals, so a quotient of times counts as a whole number of steps if
 # it differs from one by at most this fraction of it.
 _TIME_ROUNDING = 1e-6
-# Cells are given in decimals, too, so a time counts as a multiple of a cell if their
-# quotient differs from a whole number by at most this. (With a larger difference a step
-# would take the increment of another cell.)
+# Some Brownian paths are sampled over cells: intervals of the length `cell`, of which every
+# step must be a multiple. A time counts as a multiple of `cell` if their quotient differs
+# from a whole number by at most this. (With a larger difference a step would take the
+# increment of another cell.)
 _CELL_ROUNDING = 1e-3
-# A loss of variance beyond this fraction is a warning. In a heat bath the temperature falls
-# by the same fraction.
+# Users are warned if truncation takes more than this fraction of the variance of
+# increments. In a heat bath the temperature falls by the same fraction.
 _MOST_LOST_VARIANCE = 1e-3
 
 
 def checked_key(caller: str, key: Any, others: Any) -> PRNGKeyArray:
     """The key that `caller` was called with, as a typed key. Raises a `ValueError` unless
-    it is one random key, and for traced arrays in it or in the other arguments."""
-    # Inside `jit` any new array is traced, so that this one finds `jit` even if no argument
-    # is traced. Functions that close over traced values of other transformations are found
-    # later, when a result that depends on these values is read.
+    it is one random key, and if arrays in it or in `others`, the other arguments of
+    `caller`, are traced."""
+    # Inside `jit` any new array is traced, so a new array tells whether `caller` is called
+    # inside `jit` even if no argument is traced. Functions that close over traced values of
+    # other transformations are found later, when a result that depends on these values is
+    # read.
     new_array = jnp.zeros(())
     check_untraced(f"`{caller}`", (key, others, new_array))
     check_key(key, caller)
@@ -76,9 +80,9 @@ def checked_key(caller: str, key: Any, others: Any) -> PRNGKeyArray:
 def step_numbers(
     t0: Any, t1: Any, dt0: Any, ts: Sequence[Any] | np.ndarray | Array | None
 ) -> Int[np.ndarray, " times_and_1"]:
-    """The numbers of steps from `t0` to each of `ts` (to `t1` if `ts` is `None`) and last
-    of all to `t1`. Raises a `ValueError` unless all times are numbers, a whole number of
-    steps apart."""
+    """The numbers of steps from `t0` to each of `ts`, and last of all to `t1`. (If `ts` is
+    `None`, the number to `t1` comes twice.) Raises a `ValueError` unless all times are
+    numbers, a whole number of steps after `t0` and none after `t1`."""
     if dt0 is None:
         raise ValueError("`dt0` must be a number: steps are fixed; got None.")
     arguments = f"dt0={dt0!r}, t0={t0!r}, t1={t1!r}"
@@ -92,13 +96,14 @@ def step_numbers(
             f"`dt0` must be positive, and `t1` after `t0`; got {arguments}."
         )
     times = np.array([end] if ts is None else ts, float).reshape(-1)
-    # How many steps there are to each of `times`, and last of all to the end.
+    # The numbers of steps, up to rounding.
     quotients = (np.append(times, end) - begin) / step
     counts = np.round(quotients)
     roundings = _TIME_ROUNDING * np.maximum(counts, 1)
-    # Not `np.any(... > roundings)`, which is false for times that are NaN.
+    # For times that are NaN, `np.any(... > roundings)` would be false.
     if not np.all(np.abs(quotients - counts) <= roundings):
         example = ""
+        # With times before the end, one step size may not divide all intervals.
         if np.all(times == end):
             num_steps = max(1, np.ceil(quotients[-1]))
             example = f" For example, `dt0={end - begin:g} / {num_steps:.0f}`."
@@ -116,15 +121,15 @@ def step_numbers(
 
 
 def given_state(y0: Y) -> Y:
-    """The initial state in floating-point numbers. Raises a `ValueError` if it holds
-    anything else than numbers and arrays of numbers."""
+    """The initial state `y0`, with integers as floating-point numbers. Raises a
+    `ValueError` if `y0` holds anything else than numbers and arrays of numbers."""
     check_numbers("y0", y0)
     return jtu.tree_map(lambda x: jnp.asarray(x, jnp.result_type(x, float)), y0)
 
 
 def drawn_state(y0_of: Callable, key: PRNGKeyArray, args: Args) -> Y:
-    """The initial state that the user's function draws. Raises a `ValueError` for a
-    function with other arguments."""
+    """The initial state that the user's function `y0_of` draws for one path. Raises a
+    `ValueError` unless the function takes `key`, or `key` and `args`."""
     if takes_args(y0_of):
         check_takes("y0", y0_of, "key", "args")
         return given_state(y0_of(key, args))
@@ -133,8 +138,8 @@ def drawn_state(y0_of: Callable, key: PRNGKeyArray, args: Args) -> Y:
 
 
 def drawn_args(args_of: Callable, key: PRNGKeyArray) -> Args:
-    """The `args` that the user's function draws. Raises a `ValueError` for a function with
-    other arguments."""
+    """The `args` that the user's function `args_of` draws for one path. Raises a
+    `ValueError` unless the function takes `key`."""
     check_takes("args", args_of, "key")
     try:
         args = args_of(key)
@@ -146,14 +151,14 @@ def drawn_args(args_of: Callable, key: PRNGKeyArray) -> Args:
         raise
 
     check_args(args)
-    # Each path has its own arrays of JAX. All paths share leaves that are no arrays.
+    # Leaves that are no arrays are not drawn: all paths share them.
     arrays, others = eqx.partition(args, eqx.is_array)
     return eqx.combine(jtu.tree_map(jnp.asarray, arrays), others)
 
 
 def check_noise(terms: PyTree) -> None:
-    """Raises a `ValueError` if nothing in the terms is random, or if they hold one noise
-    twice."""
+    """Raises a `ValueError` if nothing in the terms is random, or if a heat bath shares its
+    noise with another term."""
     check_baths_have_own_noise(terms)
     paths = brownian_paths(terms)
     if len(paths) == 0:
@@ -190,10 +195,10 @@ def warn_of_truncation(terms: PyTree, h: float, stacklevel: int) -> None:
 
 @once_for_each_signature
 def has_discrete_increments(solver: diffrax.AbstractSolver) -> bool:
-    """Whether a solver takes discrete increments only, as weak methods do: whether the path
-    that it makes has them even for `want="strong"`."""
+    """Whether a solver takes discrete increments only, as weak methods do. Such a solver
+    makes a path with discrete increments even for `want="strong"`."""
     path = own_path(solver, "strong", (), jr.key(0))
-    # The laws of a path of the user's class may be unknown.
+    # The laws of a path are unknown if its class is the user's.
     laws = laws_of(path) or {}
     return isinstance(laws.get("W"), Discrete)
 
@@ -210,9 +215,10 @@ def check_gaussian(solver: diffrax.AbstractSolver) -> None:
 
 
 def check_cells(terms: PyTree, t0: float, h: float) -> None:
-    """Raises a `ValueError` for steps that are not made up of whole cells of a path."""
+    """Raises a `ValueError` unless steps of size `h` from `t0` on are made up of whole
+    cells of all paths that have cells."""
     for path in brownian_paths(terms):
-        # Most paths have no cells.
+        # Many classes of paths have no cells, and others have them on request only.
         cell = getattr(path, "cell", None)
         if cell is None:
             continue
@@ -225,22 +231,23 @@ def check_cells(terms: PyTree, t0: float, h: float) -> None:
 
 
 def is_multiple(time: float, cell: float) -> bool:
-    """Whether a time is a whole number of cells, up to rounding."""
+    """Whether a time is a whole multiple of `cell`, up to rounding."""
     quotient = time / cell
     return abs(quotient - round(quotient)) <= _CELL_ROUNDING
 
 
-# Raises an error unless the terms fit the state.
+# Raises an error unless the terms fit the state. Equal terms and shapes are checked once.
 check_fit = once_for_each_signature(check_terms_fit_state)
 
 
 def state_itself(t, y, args):
-    """The state: the function `phi` of a problem whose states are wanted."""
+    """The `phi` of a problem that asks for the states of paths, and not for a mean."""
     del t, args
     return y
 
 
 def _real_phi(phi: Callable, t: RealScalarLike, y: Y, args: Args) -> PyTree[Array]:
+    """The values of the user's `phi`. Raises an error unless they are real arrays."""
     values = call_user_function("phi", phi, t, y, args=args)
     check_real("phi", jtu.tree_leaves(values))
     return values
@@ -249,15 +256,17 @@ def _real_phi(phi: Callable, t: RealScalarLike, y: Y, args: Args) -> PyTree[Arra
 def traced_phi(
     phi: Callable, terms: PyTree, t0: Float[np.ndarray, ""], y0: Y, args: Args
 ) -> Callable[[RealScalarLike, Y, Args], PyTree]:
-    """The program of `phi`. Raises an error unless it takes this state and returns real
-    arrays. For spins and complex amplitudes, errors explain which state `phi` gets."""
+    """The user's `phi` as a program (see `_programs`). Raises an error unless `phi` takes
+    this state and returns real arrays. For spins and complex amplitudes, errors explain
+    which state `phi` gets."""
     if phi is state_itself:
         return phi
     check_takes("phi", phi, "t", "y", "args")
     try:
         return traced(jtu.Partial(_real_phi, phi), t0, y0, args, identity=phi)
     except (TypeError, AttributeError, IndexError) as error:
-        # A user who takes the pair for a spin `s` writes `s.x`, `s[2]` or `-s`.
+        # A user may take the pair `y` for the spin `s` itself, and write `s.x`, `s[2]` or
+        # `-s`.
         if has_lifted(terms):
             error.add_note(
                 "For spins and complex amplitudes `phi(t, y, args)` gets the pair "

@@ -1,5 +1,10 @@
-"""Simulates the paths of a batch with either engine. Both take a problem, the random key
-that all samples share, and consecutive sample numbers."""
+"""The engines: functions that simulate the paths of a batch.
+
+An engine takes a problem, the random key that all samples share, and the numbers of the
+samples, one for each path. `by_jax` runs the loop over steps of `loop`. `by_drjit` fuses
+the steps of many paths into a kernel of Dr.Jit. Stragglers are the paths that a kernel does
+not finish: JAX simulates them again.
+"""
 
 import dataclasses
 import functools as ft
@@ -35,17 +40,17 @@ from .problem import Problem
 
 # Above this share of all paths, stragglers take most of the time.
 _LARGEST_SHARE_OF_STRAGGLERS = 0.05
-# Dr.Jit aborts the process if two threads call one frozen function at the same time. A
-# kernel uses all cores, so that taking turns costs no time.
+# Dr.Jit aborts the process if two threads call one frozen function at the same time, so
+# threads take turns. This costs no time, since a kernel uses all cores.
 _IN_TURN = threading.RLock()
 
 
 def warn_of_stragglers(
     num_stragglers: int, num_failed: int, num_paths: int, stacklevel: int
 ) -> None:
-    """Warns if JAX simulated many paths again, besides those that failed."""
-    # Failed paths are stragglers that JAX could not solve either. They do not count, since
-    # the warning advises `engine="jax"`, which would not help them.
+    """Warns if JAX simulated many paths again, and with success."""
+    # Failed paths are stragglers that JAX could not solve either. Failed paths do not
+    # count, since the warning advises `engine="jax"`, by which they would fail, too.
     num_rescued = num_stragglers - num_failed
     if num_rescued > _LARGEST_SHARE_OF_STRAGGLERS * num_paths:
         warnings.warn(
@@ -58,10 +63,11 @@ def warn_of_stragglers(
 
 
 class Batch(NamedTuple):
-    """Paths along the first axis of each array, saved times along the second.
+    """The paths of a batch.
 
-    - `y`: the states.
-    - `failed`: which paths failed. The states of these are meaningless.
+    - `y`: the states, with paths along the first axis of each array, and saved times along
+        the second. The states of failed paths are meaningless.
+    - `failed`: which paths failed.
     - `num_stragglers`: how many paths the fused kernel handed back to JAX.
     """
 
@@ -73,17 +79,18 @@ class Batch(NamedTuple):
 def by_jax(
     problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> Batch:
-    """The paths with these sample numbers on one level, simulated by JAX. The loop is that
-    of `expectation`, which runs all levels of the problem: the others are dropped."""
-    states_and_failed = _paths_by_jax(problem, key, _words(sample_numbers))
+    """The paths with these sample numbers on one level, simulated by JAX. The loop over
+    steps always runs all levels of the problem. The other levels are dropped."""
+    states_and_failed = _paths_by_jax(problem, key, _high_and_low(sample_numbers))
     # The results are traced if a function of the user closes over traced values.
     check_untraced("`ensemble`", states_and_failed)
     y, failed = jax.device_get(states_and_failed)
     return Batch(jtu.tree_map(lambda x: x[level], y), failed[level])
 
 
-def _words(sample_numbers: np.ndarray) -> UInt32[np.ndarray, "2 n"]:
-    """The high and the low 32 bits of 64-bit numbers."""
+def _high_and_low(sample_numbers: np.ndarray) -> UInt32[np.ndarray, "2 n"]:
+    """The high and the low 32 bits of 64-bit numbers, since JAX may have no 64-bit
+    integers. The parameter `words` of functions below is such an array."""
     high = sample_numbers >> np.uint64(32)
     low = sample_numbers & np.uint64(0xFFFFFFFF)
     return np.stack([high, low]).astype(np.uint32)
@@ -92,7 +99,7 @@ def _words(sample_numbers: np.ndarray) -> UInt32[np.ndarray, "2 n"]:
 def _sample_keys(
     key: PRNGKeyArray, words: UInt32[Array | np.ndarray, "2 n"]
 ) -> Key[Array, " n"]:
-    """The random keys of the samples with these numbers."""
+    """The random keys of the samples whose numbers have the bits `words`."""
     return jax.vmap(ft.partial(sample_key, key))(*words)
 
 
@@ -100,7 +107,7 @@ def _sample_keys(
 def _draw_starts(
     problem: Problem, key: PRNGKeyArray, words: UInt32[Array | np.ndarray, "2 n"]
 ) -> tuple[PyTree, PyTree]:
-    """`Problem.draw_start` for the paths of a batch."""
+    """The results of `Problem.draw_start` for the paths of a batch."""
     return jax.vmap(problem.draw_start)(_sample_keys(key, words))
 
 
@@ -109,8 +116,8 @@ def _draw_starts(
 def _paths_by_jax(
     problem: Problem, key: PRNGKeyArray, words: UInt32[Array | np.ndarray, "2 n"]
 ) -> tuple[PyTree[Array], Bool[Array, "levels n"]]:
-    """The saved states of the paths of a batch, along axes of levels, paths and times, and
-    which paths failed."""
+    """The saved states of the paths of a batch, whose first axes are those of levels, paths
+    and times, and which paths failed."""
     # (levels, times, paths, entries of the state)
     states, failed = values_of_paths(problem, _sample_keys(key, words))
     # (levels, paths, times, entries of the state)
@@ -121,11 +128,11 @@ def _paths_by_jax(
 def by_drjit(
     problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> Batch:
-    """The paths with these sample numbers, on one level, simulated by a fused kernel. JAX
+    """The paths with these sample numbers on one level, simulated by a fused kernel. JAX
     simulates again the paths that the kernel could not finish.
 
-    Raises an `ImportError` without Dr.Jit, and a `ValueError` if the system cannot be
-    replayed."""
+    Raises an `ImportError` without Dr.Jit, and a `ValueError` if an operation of the
+    problem cannot be replayed by Dr.Jit."""
     try:
         with _IN_TURN:
             fused = _fused_batch(problem, key, sample_numbers, level)
@@ -138,7 +145,7 @@ def by_drjit(
         refusal = _refusal(error)
         if refusal is None:
             raise
-        # The errors behind the refusal are about recordings, and pages long.
+        # The errors behind the refusal are about Dr.Jit's recordings, and pages long.
         raise refusal from None
     if fused.num_stragglers == 0:
         return fused
@@ -148,12 +155,13 @@ def by_drjit(
 def _fused_batch(
     problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int
 ) -> Batch:
-    """The paths of a batch from the kernel alone: those that it did not finish count as
+    """The paths of a batch by the kernel alone. Paths that it did not finish count as
     failed."""
     kernels, lanes, shared = fused_start(problem, key, sample_numbers, level)
     saved_steps = np.asarray(problem.level(level).saved_steps)
-    # By the number of steps before a saved time: (paths, entries of the state). The kernel
-    # is called once for all steps from one saved time to the next.
+    # The kernel is called once for all steps from one saved time to the next. For each
+    # number of steps to a saved time, the states at this time: (paths, entries of the
+    # state).
     states_after: dict[int, np.ndarray] = {}
     num_steps_done = 0
     for num_steps in np.unique(saved_steps).tolist():
@@ -162,10 +170,10 @@ def _fused_batch(
             lanes = kernels.advance(lanes, shared, num_steps_done, num_steps)
         num_steps_done = num_steps
         states_after[num_steps] = np.stack([*map(np.asarray, lanes.y)], axis=-1)
-    # (paths, times, entries of the state). `ts` may repeat a time.
+    # (paths, times, entries of the state). `ts` may be in any order, and repeat a time.
     states = np.stack([states_after[step] for step in saved_steps.tolist()], axis=1)
-    # A copy, so that no array of Dr.Jit outlives this call, during which no other thread
-    # uses Dr.Jit.
+    # The mask is copied, so that no array of Dr.Jit outlives this call, during which no
+    # other thread uses Dr.Jit.
     is_unfinished = np.array(lanes.stopped)
     return Batch(
         y=Layout.of(problem.y0).unravel(states),
@@ -177,11 +185,36 @@ def _fused_batch(
 def fused_start(
     problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> tuple[Kernels, Lanes, dict[str, Any]]:
-    """The kernels of the problem, which are compiled unless they are known; what differs
-    between the paths with these sample numbers before their first step, and what they
-    share. `kernels.advance(lanes, shared, first_step, end_step)` takes their steps."""
+    """The paths with these sample numbers before their first step, and the kernels that
+    take their steps by `kernels.advance(lanes, shared, first_step, end_step)`:
+
+    - `kernels`, which are compiled unless they were compiled before;
+    - `lanes`: what differs between the paths, as arrays with an entry for each path;
+    - `shared`: what all paths share.
+    """
+    kernels, arrays = _kernels_and_arrays(problem, key)
+    y0 = problem.y0
+    own_args = None
+    if problem.paths_differ:
+        y0, own_args = _draw_starts(problem, key, _high_and_low(sample_numbers))
+    lanes, shared = kernels.lanes_and_shared(
+        arrays,
+        key,
+        h=problem.level(level).h,
+        first_path=int(sample_numbers[0]),
+        num_paths=len(sample_numbers),
+        y0=y0,
+        own_args=own_args,
+    )
+    return kernels, lanes, shared
+
+
+def _kernels_and_arrays(
+    problem: Problem, key: PRNGKeyArray
+) -> tuple[Kernels, list[Array]]:
+    """The kernels of a problem, and the arrays in it, which are inputs of the kernels."""
     # Kernels have plain sweeps for root finders. Step sizes, times and numbers of steps are
-    # inputs of a kernel, which is compiled for placeholders.
+    # inputs of a kernel, so placeholders stand for them when it is compiled.
     zero = jnp.zeros(1, jnp.int32)
     any_h = jnp.ones_like(problem.levels.h[:1])
     compiled_problem = dataclasses.replace(
@@ -199,24 +232,11 @@ def fused_start(
     functions, arrays = functions_and_arrays(
         compiled_problem, key, example_args, problem.paths_differ
     )
-    kernels = _kernels(functions)
-    y0 = problem.y0
-    own_args = None
-    if problem.paths_differ:
-        y0, own_args = _draw_starts(problem, key, _words(sample_numbers))
-    lanes, shared = kernels.lanes_and_shared(
-        arrays,
-        key,
-        h=problem.level(level).h,
-        first_path=int(sample_numbers[0]),
-        num_paths=len(sample_numbers),
-        y0=y0,
-        own_args=own_args,
-    )
-    return kernels, lanes, shared
+    return _kernels(functions), arrays
 
 
-# A kernel keeps all that the user's functions capture, so only a few kernels are kept.
+# The kernels that were compiled for these functions before, or new ones. Kernels hold all
+# that the user's functions capture, so only a few of them are kept.
 _kernels = ft.lru_cache(maxsize=8)(Kernels)
 
 
@@ -227,17 +247,17 @@ def _with_stragglers(
     level: int,
     fused: Batch,
 ) -> Batch:
-    """The `fused` paths of a batch, in which those that the kernel did not finish, one or
-    more, are replaced by paths that JAX simulates."""
-    # JAX begins anew. To go on from where the kernel stopped it would need the solver's
-    # state, and it would not give the same paths as without a kernel.
+    """The batch `fused`, whose stragglers (one or more) are replaced by paths that JAX
+    simulates."""
     (stragglers,) = np.nonzero(fused.failed)
     num_stragglers = len(stragglers)
-    # Their number is rounded up to a power of four, by repeating stragglers, so that JAX
-    # compiles few programs.
+    # JAX compiles a program for each number of paths. So that there are few, stragglers are
+    # repeated until their number is a power of four.
     power_of_four = 4 ** int(np.ceil(np.log(num_stragglers) / np.log(4)))
     num_to_solve = min(len(sample_numbers), power_of_four)
     repeated_stragglers = np.resize(stragglers, num_to_solve)
+    # JAX simulates the paths from their start. To go on from where the kernel stopped, it
+    # would need the solver's state, and would not give the same paths as without a kernel.
     solved = by_jax(problem, key, sample_numbers[repeated_stragglers], level)
 
     def with_solved(fused_leaf: np.ndarray, solved_leaf: np.ndarray) -> np.ndarray:
@@ -245,23 +265,23 @@ def _with_stragglers(
         leaf[stragglers] = solved_leaf[:num_stragglers]
         return leaf
 
-    # So far all stragglers counted as failed.
+    # All stragglers count as failed in `fused`.
     failed = with_solved(fused.failed, solved.failed)
     y = jtu.tree_map(with_solved, fused.y, solved.y)
     return Batch(y, failed, num_stragglers)
 
 
 def _refusal(error: BaseException | None) -> ValueError | None:
-    """The error for the user if an operation cannot be replayed; `None` if the error is
-    another one, to be raised as it is."""
-    # Dr.Jit raises errors of its own from those of the functions that it records.
+    """The error to raise for the user if `error` comes from an operation that Dr.Jit cannot
+    replay; `None` if it has another cause, and should be raised as it is."""
+    # Dr.Jit may have raised an error of its own from a `NotReplayed` in what it records.
     cause = error
     while cause is not None and not isinstance(cause, NotReplayed):
         cause = cause.__cause__ or cause.__context__
     if cause is None:
         return None
-    # The user's function from which the operation comes is the first one outside of
-    # installed packages. JAX may have recorded none.
+    # The user's function that needs the operation is the first one outside of this package
+    # and of installed ones. JAX may have recorded none.
     origin = ""
     package = str(Path(__file__).parents[1])
     for source in source_lines(cause.location):
@@ -276,7 +296,4 @@ def _refusal(error: BaseException | None) -> ValueError | None:
 
 
 # From the name of an engine to the function that simulates a batch.
-ENGINES: dict[str, Callable[..., Batch]] = {
-    "jax": by_jax,
-    "drjit": by_drjit,
-}
+ENGINES: dict[str, Callable[..., Batch]] = {"jax": by_jax, "drjit": by_drjit}

@@ -18,10 +18,11 @@ from .levels import Level
 from .problem import Problem
 
 
-# The number of paths that take a step at once on CPUs. The arrays of more paths would not
-# fit into the cache in every sweep over their stage equations: for a million paths of
-# `ArrayRQMC` by the midpoint rule blocks save a quarter to a half of the processor time. In
-# smaller blocks the batches of `ensemble` take up to a fifth longer.
+# The number of paths that take a step at once on CPUs. The stage equations of an implicit
+# step are solved by sweeps over the arrays of all these paths. With more paths, the arrays
+# would not fit into the cache: for a million paths of `ArrayRQMC` by the midpoint rule,
+# blocks save a quarter to a half of the processor time. In smaller blocks the batches of
+# `ensemble` take up to a fifth longer.
 _PATHS_AT_ONCE = 2**16
 
 
@@ -30,9 +31,9 @@ class PathStates(eqx.Module):
 
     - `y`: the state of the equation.
     - `solver_state`: the arrays of the solver's state.
-    - `failed`: which paths have failed. A failed path stays failed, and continues from
-        `y0`: otherwise stage equations without a solution would hold up the other paths in
-        every later step.
+    - `failed`: which paths have failed. A failed path stays failed, but continues from the
+        `y0` of the problem: stage equations without a solution would hold up the other
+        paths in every later step.
     - `args`: the arrays of `args`, if each path has its own.
     - `control`: the control variate, if any.
     """
@@ -50,8 +51,8 @@ class PathStates(eqx.Module):
         solver_state: PyTree[Array],
         control: Any = None,
     ) -> "PathStates":
-        """Paths before their first step, from `Problem.draw_start` for each. A path whose
-        initial state is not finite has failed."""
+        """The paths before their first step, from the results of `Problem.draw_start` for
+        each. A path whose initial state is not finite has failed."""
         y0, args = starts
         # Without a barrier XLA checks a start that is constant, such as momenta at rest,
         # while compiling: for 30,000 paths of 36 momenta this takes 3 seconds.
@@ -68,7 +69,8 @@ class PathStates(eqx.Module):
         success: Bool[Array, " n"],
         control: Any = None,
     ) -> "PathStates":
-        """The paths after a step to `y`, with failed paths reset."""
+        """The paths after a step to `y`. Paths that have failed, in this step or before,
+        are reset to the `y0` of the problem, and to their solver state before the step."""
         failed = self.failed | ~success
         solver_state = _replaced_where(failed, solver_state, self.solver_state)
         y = _replaced_where(failed, y, problem.y0)
@@ -78,8 +80,8 @@ class PathStates(eqx.Module):
 def _replaced_where(
     failed: Bool[Array, " n"], values: PyTree, replacements: PyTree
 ) -> PyTree:
-    """The values of all paths, with the replacements for failed ones. A replacement is one
-    for all paths, or has an axis of paths, too."""
+    """The values of all paths, with replacements for those of failed paths. An array of
+    replacements has an axis of paths, or is the same for all paths and has no such axis."""
 
     def replaced(value: Array, replacement: Array) -> Array:
         return jnp.where(mask_like(failed, value), replacement, value)
@@ -88,9 +90,9 @@ def _replaced_where(
 
 
 class Motion(NamedTuple):
-    """How the paths of a level move.
+    """How the paths of one level move.
 
-    - `step`: maps the number of a step and the paths before it to those after it.
+    - `step`: maps the number of a step and the paths before this step to the paths after.
     - `start`: the paths before step 0.
     """
 
@@ -99,9 +101,10 @@ class Motion(NamedTuple):
 
 
 class Simulated(NamedTuple):
-    """The paths of all levels, or of one level without the axis of levels.
+    """The results of `simulate` for all levels, along a leading axis. (Within `simulate`,
+    those of one level have no such axis.)
 
-    - `saved`: the measured values after each saved step.
+    - `saved`: what `measure` of `simulate` returned at each saved time.
     - `failed`: which paths have failed at the end.
     - `control`: the control variates at the end.
     """
@@ -112,7 +115,7 @@ class Simulated(NamedTuple):
 
 
 def _phi_itself(phi: Array, failed: Bool[Array, " n"]) -> Array:
-    """The values of `phi`: the measurement that saves them as they are."""
+    """The default of `measure` in `simulate`: saves the values of `phi` as they are."""
     del failed
     return phi
 
@@ -122,15 +125,16 @@ def simulate(
     motion_on: Callable[[Level], Motion],
     measure: Callable[[Array, Bool[Array, " n"]], Array] = _phi_itself,
 ) -> Simulated:
-    """Simulates the paths of all levels, which move as `motion_on(level)` says. After each
-    saved step `measure(phi, failed)` is saved, with `phi` of shape `(n, m)`."""
+    """Simulates the paths of all levels, which move as `motion_on(level)` says. At each
+    saved time `measure(phi, failed)` is saved: `phi` has shape `(n, m)`, with the values of
+    `problem.phi` for each of `n` paths, and `failed` says which paths have failed."""
 
     def measure_if_saved(
         level: Level, num_steps: Any, paths: PathStates, saved: Float[Array, "S ..."]
     ) -> tuple[PathStates, Float[Array, "S ..."]]:
-        """The paths after so many steps, and the saved values, with a measurement among
-        them if these steps end at a saved time. A path whose `phi` is not finite has
-        failed."""
+        """Adds a measurement to `saved` if the time after `num_steps` steps is a saved one.
+        A path whose `phi` is then not finite has failed, and is marked so in the returned
+        paths."""
 
         def with_measurement():
             t = problem.t0 + num_steps * level.h
@@ -144,7 +148,8 @@ def simulate(
             is_row_of_time = mask_like(level.saved_steps == num_steps, saved)
             return failed, jnp.where(is_row_of_time, measure(phi, failed), saved)
 
-        # One predicate for all paths, so that `phi` is evaluated only after saved steps.
+        # The predicate is one truth value for all paths. With a value for each path, JAX
+        # would evaluate `phi` after every step.
         is_saved = jnp.any(level.saved_steps == num_steps)
         failed, saved = lax.cond(
             is_saved, with_measurement, lambda: (paths.failed, saved)
@@ -161,9 +166,9 @@ def simulate(
         num_saves, m = problem.output_shape
         dtype = problem.dtype_of_values
         phi = jax.ShapeDtypeStruct((len(motion.start.failed), m), dtype)
-        measured = jax.eval_shape(measure, phi, motion.start.failed)
-        nothing_saved = jnp.zeros((num_saves, *measured.shape), dtype)
-        # A saved time may be `t0`.
+        measurement = jax.eval_shape(measure, phi, motion.start.failed)
+        nothing_saved = jnp.zeros((num_saves, *measurement.shape), dtype)
+        # A saved time may be `t0`, before the first step.
         carry = measure_if_saved(level, 0, motion.start, nothing_saved)
         paths, saved = lax.fori_loop(0, level.num_steps, step_and_measure, carry)
         return Simulated(saved, paths.failed, paths.control)
@@ -182,9 +187,11 @@ def independent_motion(
     terms_of: Callable[[Any], PyTree],
     randomness_of_step: Callable[[Any], PyTree[Array]],
 ) -> Motion:
-    """The motion of independent paths from these starts. `randomness_of_step(i)` is a
-    PyTree of random numbers or keys for step `i`, with a row for each path; in this step, a
-    path with this `row` has the terms `terms_of(row)`."""
+    """The motion of independent paths from `starts`, the results of `Problem.draw_start`.
+
+    `randomness_of_step(i)` is a PyTree of random numbers or keys for step `i`, with a row
+    for each path. In step `i`, a path has the terms `terms_of(row)`, made from its row.
+    """
 
     def step(i: Any, paths: PathStates) -> PathStates:
         def step_of_path(row, y, solver_state, args):
@@ -200,8 +207,8 @@ def independent_motion(
         problem_of_path = problem.with_args(args)
         return problem_of_path.init(terms_of(row), 0, level.h, y)
 
-    # `PathStates.start` replaces states that are not finite, but solver states are those of
-    # the states before: such a path has failed, so its solver state does not matter.
+    # These are made before `PathStates.start` replaces initial states that are not finite.
+    # A path with such a state has failed, so its solver state does not matter.
     solver_state = jax.vmap(solver_state_at_start)(randomness_of_step(0), *starts)
     return Motion(step, PathStates.start(problem, starts, solver_state))
 
@@ -209,8 +216,8 @@ def independent_motion(
 def values_of_paths(
     problem: Problem, keys: Key[Array, " n"]
 ) -> tuple[Float[Array, "levels S n m"], Bool[Array, "levels n"]]:
-    """The values of `phi` for independent paths, one for each key, on all levels and at the
-    times at which to average, and which paths failed."""
+    """Simulates independent paths, one for each key, on all levels. Returns the values of
+    `phi` at all saved times, and which paths failed."""
     keys_of_paths = jax.vmap(lambda key: path_keys(problem.terms, key))(keys)
     starts = jax.vmap(problem.draw_start)(keys)
 
@@ -229,10 +236,11 @@ def values_of_paths(
 
 
 def _vmapped_in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
-    """`jax.vmap(fn)(*args)`, for many paths on CPUs one block after another."""
+    """The result of `jax.vmap(fn)(*args)`. For many paths on CPUs it is computed for one
+    block of paths after another."""
     num_paths = len(jtu.tree_leaves(args)[0])
-    # Numbers of paths that leave a smaller block are not divided: that block would need a
-    # program of its own.
+    # If blocks of equal size would leave some paths over, there are no blocks, since a
+    # smaller one would need a program of its own.
     has_whole_blocks = num_paths > _PATHS_AT_ONCE and num_paths % _PATHS_AT_ONCE == 0
     if not has_whole_blocks or jax.default_backend() != "cpu":
         return jax.vmap(fn)(*args)
@@ -240,12 +248,13 @@ def _vmapped_in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
     def in_blocks(x: Array) -> Array:
         return x.reshape(-1, _PATHS_AT_ONCE, *x.shape[1:])
 
-    # Not `lax.map` with `batch_size`, by which older versions of JAX trace `fn` once more,
-    # for a remainder of no paths.
+    # `lax.map` could make blocks by its `batch_size`, but older versions of JAX then trace
+    # `fn` once more, for a remainder of no paths.
     results = lax.map(lambda block: jax.vmap(fn)(*block), jtu.tree_map(in_blocks, args))
     return jtu.tree_map(lambda x: x.reshape(num_paths, *x.shape[2:]), results)
 
 
 def mask_like(mask: Bool[Array, " n"], x: Array) -> Array:
-    """A mask of the first axis of `x`, with axes of length 1 for the others."""
+    """The mask, which is for the first axis of `x`, with axes of length 1 for the others,
+    so that it broadcasts against `x`."""
     return mask.reshape(-1, *[1] * (x.ndim - 1))

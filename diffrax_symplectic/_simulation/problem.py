@@ -1,7 +1,7 @@
-"""An expectation to compute: the checked arguments, and single steps.
+"""`Problem`: the checked arguments of `expectation` or `ensemble`, and single steps.
 
-Axes of arrays, here and in what simulates a problem: `n` paths, `d` entries of the state,
-`S` times at which to average (saves), `m` numbers in `phi`.
+Names of axes of arrays, here and in the modules that simulate a problem: `n` paths, `d`
+entries of the state, `S` saved times (those at which to average), `m` numbers in `phi`.
 """
 
 import dataclasses
@@ -66,20 +66,26 @@ from .layout import Layout
 from .levels import halved, Level, level_weights, levels_of, MOST_LEVELS
 
 
-# The number that is folded into the key of a sample to draw its `y0` and `args`. For the
-# Brownian paths, the words of the user's keys are folded into the same key. This arbitrary
-# number is unlikely to be one of them.
+# The number that is folded into the key of a sample to draw its `y0` and `args`. To draw
+# its Brownian paths, the 32-bit words of the user's keys are folded into the same key. This
+# arbitrary number is unlikely to be one of these words.
 _START_KEY = 0x517A87
-# The `unit` of truncated increments that are made here, in units of the interval from `t0`
-# to `t1`: one step over all of it loses 0.04% of its variance, which is no warning.
+# The `unit` of a `TruncatedBrownianPath` that is made here, as a multiple of the interval
+# from `t0` to `t1`. A single step over the whole interval then loses 0.04% of its variance,
+# of which users need not be warned.
 _UNIT_OF_TRUNCATION = 32
 
 
 class Problem(eqx.Module):
-    """The arguments of `expectation`, by the same names, and the levels, along a leading
-    axis. Where `y0` or `args` is a function of a random key, `y0` and `args` are an example
-    of its values. Outside of programs times, levels and weights are NumPy arrays: there
-    each operation of JAX is a program of its own, which takes some 20 ms to compile."""
+    """The arguments of `expectation`, by the same names, and what follows from them.
+
+    If the user passes a function of a random key as `y0` or `args`, the field with this
+    name holds an example that the function has drawn, and `y0_of` or `args_of` holds the
+    function.
+
+    Outside of compiled programs times, levels and weights are NumPy arrays, since there
+    each operation of JAX is a program of its own, which takes some 20 ms to compile.
+    """
 
     phi: Callable[[RealScalarLike, Y, Args], PyTree]
     terms: PyTree[diffrax.AbstractTerm]
@@ -87,16 +93,17 @@ class Problem(eqx.Module):
     t0: Float[Array | np.ndarray, ""]
     y0: Y
     args: Args
-    # The functions of a random key that draw `y0` and `args` for each path.
+    # The functions that draw `y0` and `args` for each path; `None` if all paths share them.
     y0_of: Callable | None
     args_of: Callable | None
+    # All levels, along a leading axis.
     levels: Level
-    # An array, so that other weights do not compile anew.
+    # The `level_weights`, as an array, so that other weights compile nothing anew.
     weights: Float[Array | np.ndarray, "combinations levels"]
     # Whether to average at `t1` only, without an axis of times.
     at_end: bool = eqx.field(static=True)
-    # Which paths of the terms are one Brownian motion. Programs, whose keys are traced,
-    # cannot tell.
+    # For each path of the terms, the number of its Brownian motion. It is stored, since a
+    # compiled program, in which keys are traced, cannot tell which paths are equal.
     motion_numbers: tuple[int, ...] = eqx.field(static=True)
 
     @staticmethod
@@ -115,101 +122,60 @@ class Problem(eqx.Module):
         caller: str = "expectation",
         key: PRNGKeyArray | None = None,
     ) -> "Problem":
-        """The problem of these arguments of `caller`, with a path of the solver in place of
-        each shape in `terms`. `want` is the purpose of these paths, and `key` a key of the
-        generator that draws starts. Raises a `ValueError` for bad arguments."""
-        levels = whole_number("levels", levels, 1, MOST_LEVELS)
+        """The problem of these arguments of the function `caller`. In `terms`, a path of
+        the solver for the purpose `want` takes the place of each shape. Examples of `y0`
+        and `args` are drawn from `key`, which may be any key of the user's random number
+        generator. Raises a `ValueError` for bad arguments."""
+        num_levels = whole_number("levels", levels, 1, MOST_LEVELS)
         check_terms(terms)
         check_solver("solver", solver)
         check_made_for_noise(solver)
         # For each path in `terms`, whether the solver makes it.
         is_made_by_solver = which_are_shapes(terms)
-        # The paths get keys for an example. In each sample others take their place.
+        # The paths get keys for an example. In each sample other keys take their place.
         terms = with_paths_for_shapes(terms, ft.partial(own_path, solver, want))
         numbers_of_steps = step_numbers(t0, t1, dt0, ts)
-
-        # Where `args` or `y0` is drawn, an example takes its place. All draws have the same
-        # structure, so it may be drawn from any key.
-        args_of = args if callable(args) else None
         key = jr.key(0) if key is None else key
-        if args_of is not None:
-            args = drawn_args(args_of, key)
-            args_of = traced(ft.partial(drawn_args, args_of), key, identity=args_of)
-        else:
-            check_args(args)
-        y0_of = y0 if callable(y0) else None
-        y0 = given_state(y0) if y0_of is None else drawn_state(y0_of, key, args)
-        check_state(caller, y0)
-        is_finite = all(np.all(np.isfinite(leaf)) for leaf in jtu.tree_leaves(y0))
-        if y0_of is None and not is_finite:
-            raise ValueError(f"`y0` must hold finite numbers; got {brief(y0)}.")
-
+        y0, y0_of, args, args_of = _with_examples(y0, args, key, caller)
         check_drifts_differ(terms)
         # Times have the dtype of the state.
-        t0_of_dtype = np.asarray(t0, jnp.result_type(*jtu.tree_leaves(y0)))
-
-        def programs_for(args: Args) -> tuple:
-            """The functions of the problem, each traced once with these `args`, so that
-            what it closes over is known; and `args`."""
-            draw_y0 = None
-            if y0_of is not None:
-                draw = ft.partial(drawn_state, y0_of)
-                draw_y0 = traced(draw, key, args, identity=y0_of)
-            return (
-                traced_phi(phi, terms, t0_of_dtype, y0, args),
-                with_programs(terms, t0_of_dtype, y0, args),
-                with_programs(solver, t0_of_dtype, y0, args),
-                draw_y0,
-                args,
-            )
-
-        def float_as_array(x: Any) -> Any:
-            # Integers are kept: they may be exponents or sizes.
-            return jnp.asarray(x) if type(x) is float else x
-
-        # With arrays in place of Python numbers, other numbers compile nothing anew. But a
-        # function of the user may need the numbers themselves, for example in an `if`.
-        try:
-            programs = programs_for(jtu.tree_map(float_as_array, args))
-        except (ValueError, *NEED_VALUES):
-            programs = None
-        # Not within `except`: an error would be printed together with the one before.
-        if programs is None:
-            programs = programs_for(args)
-        phi, terms, solver, y0_of, args = programs
+        dtype = jnp.result_type(*jtu.tree_leaves(y0))
+        t0_array = np.asarray(t0, dtype)
+        phi, terms, solver, y0_of, args = _as_programs(
+            phi, terms, solver, y0_of, t0_array, y0, args, key
+        )
         # What functions close over is now a part of their programs.
         check_untraced(f"`{caller}`", (phi, terms, solver, y0_of, args_of))
-        check_fit(terms, t0_of_dtype, y0, args)
-        # These need the values of `y0`, which in the program of a solve are traced.
-        check_assertions(terms, t0_of_dtype, y0, args)
+        check_fit(terms, t0_array, y0, args)
+        # Assertions and constraints are checked here, where the values of `y0` are known.
+        # In the program of a solve they are traced.
+        check_assertions(terms, t0_array, y0, args)
         if constraint_of(terms) is not None:
-            check_start(terms, t0_of_dtype, y0, args)
+            check_start(terms, t0_array, y0, args)
         check_noise(terms)
-        if isinstance(solver, diffrax.AbstractImplicitSolver) and any(
-            is_made_by_solver
-        ):
-            needed = which_need_truncation(terms, t0_of_dtype, y0, args)
+        has_root_finder = isinstance(solver, diffrax.AbstractImplicitSolver)
+        if has_root_finder and any(is_made_by_solver):
+            needed = which_need_truncation(terms, t0_array, y0, args)
             # Paths of the user are kept as they are.
-            which = [
-                is_made and need for is_made, need in zip(is_made_by_solver, needed)
-            ]
-            # All levels have the same unit. An array: another one compiles nothing anew.
+            which = [made and need for made, need in zip(is_made_by_solver, needed)]
+            # One unit serves all levels. It is an array, so that another one compiles
+            # nothing anew.
             unit = _UNIT_OF_TRUNCATION * (float(t1) - float(t0))
-            terms = with_truncation(terms, which, np.asarray(unit, t0_of_dtype.dtype))
+            terms = with_truncation(terms, which, np.asarray(unit, dtype))
         check_truncation(terms, float(dt0))
-        smallest_step = float(dt0) / 2 ** (levels - 1)
+        smallest_step = float(dt0) / 2 ** (num_levels - 1)
         if isinstance(solver, AbstractSymplecticSolver):
-            check_resolution(smallest_step, float(t0), float(t1), t0_of_dtype.dtype)
-        check_stratonovich(terms, solver, t0_of_dtype, y0, args, all_terms=True)
+            check_resolution(smallest_step, float(t0), float(t1), dtype)
+        check_stratonovich(terms, solver, t0_array, y0, args, all_terms=True)
         check_cells(terms, float(t0), smallest_step)
-
-        all_levels = levels_of(float(dt0), numbers_of_steps, levels, t0_of_dtype.dtype)
-        weights = level_weights(_order_of(solver, terms), levels)
+        # First, since it refuses numbers of levels for which weights cannot be computed.
+        all_levels = levels_of(float(dt0), numbers_of_steps, num_levels, dtype)
+        weights = level_weights(_order_of(solver, terms), num_levels)
         return Problem(
             phi=phi,
             terms=terms,
             solver=solver,
-            t0=t0_of_dtype,
+            t0=t0_array,
             y0=y0,
             args=args,
             y0_of=y0_of,
@@ -225,7 +191,7 @@ class Problem(eqx.Module):
         return dataclasses.replace(self, levels=halved(self.levels))
 
     def level(self, index: IntScalarLike) -> Level:
-        """The level with this number, which may be traced within a program."""
+        """The level with this number, which may be traced."""
         return jtu.tree_map(lambda x: x[index], self.levels)
 
     @property
@@ -240,12 +206,12 @@ class Problem(eqx.Module):
 
     @property
     def digests(self) -> dict[str, str]:
-        """What tells this problem from others, by the names of arguments."""
+        """A hash of each argument, by its name, as in `Expectation`."""
         level = self.level(0)
 
         def times(num_steps: Any) -> np.ndarray:
-            # The same time, from steps of other sizes, has other rounding errors. In single
-            # precision these are rounded off.
+            # A time that is reached by steps of another size has another rounding error.
+            # Single precision rounds these errors off.
             return np.asarray(self.t0 + num_steps * level.h, np.float32)
 
         arguments = dict(
@@ -272,8 +238,8 @@ class Problem(eqx.Module):
         return self.y0_of is not None or self.args_of is not None
 
     def draw_start(self, key: PRNGKeyArray) -> tuple[Y, PyTree[Array]]:
-        """The initial state of the sample with this key, and the arrays in its `args`;
-        `None` if all paths have the same `args`."""
+        """The initial state of the path with this key, and the arrays in its `args`. In
+        place of the arrays stands `None` if all paths have the same `args`."""
         y0_key, args_key = jr.split(jr.fold_in(key, _START_KEY))
         own_args = None
         if self.args_of is not None:
@@ -284,7 +250,8 @@ class Problem(eqx.Module):
         return y0, own_args
 
     def with_args(self, own_args: PyTree[Array]) -> "Problem":
-        """The problem of a path with these arrays in its `args`, as from `draw_start`."""
+        """The problem of a single path: `own_args` are the arrays in its `args`, as from
+        `draw_start`."""
         if self.args_of is None and own_args is None:
             return self
         shared_args = eqx.filter(self.args, eqx.is_array, inverse=True)
@@ -293,8 +260,8 @@ class Problem(eqx.Module):
     def init(
         self, terms: PyTree, i: Any, h: Float[Array | np.ndarray, ""], y: Y
     ) -> PyTree[Array]:
-        """The arrays of the solver's state before step `i`. The rest of the state does not
-        change."""
+        """The arrays of the solver's state before step `i`. (The rest of the solver's state
+        is the same in all steps.)"""
         t = self.t0 + i * h
         state = self.solver.init(terms, t, t + h, y, self.args)
         return eqx.filter(state, eqx.is_array)
@@ -313,8 +280,9 @@ class Problem(eqx.Module):
         # of the next step.
         t = self.t0 + i * h
         next_t = self.t0 + (i + 1) * h
-        # Only arrays are carried from step to step. The rest of the solver's state never
-        # changes: it is taken from an initial state, of which no array is computed.
+        # Only arrays are carried from step to step. The rest of the solver's state is the
+        # same in all steps: it is taken from an initial state, of which no array is
+        # computed.
         initial_state = eqx.filter_eval_shape(
             self.solver.init, terms, t, next_t, y, self.args
         )
@@ -337,8 +305,8 @@ class Problem(eqx.Module):
 
     @property
     def layout(self) -> Layout:
-        """How the vectors of samples make PyTrees like `phi`, with an axis of times unless
-        the mean is at `t1` only."""
+        """The layout of vectors of all numbers of `phi` at all saved times. PyTrees have an
+        axis of times unless the mean is at `t1` only."""
         num_times, _ = self.output_shape
         return Layout.of(self._struct_of_phi, None if self.at_end else num_times)
 
@@ -362,7 +330,7 @@ class Problem(eqx.Module):
 
     @property
     def dtype(self) -> Any:
-        """The dtype of the state, which times and fits have, too."""
+        """The dtype of the state, which is also that of times."""
         return jnp.result_type(*jtu.tree_leaves(self.y0))
 
     @property
@@ -372,8 +340,73 @@ class Problem(eqx.Module):
 
     @property
     def output_shape(self) -> tuple[int, int]:
-        """The number `S` of times at which to average, and `m` of components of `phi`."""
+        """The number `S` of saved times, and the number `m` of numbers in `phi`."""
         return self.levels.saved_steps.shape[1], Layout.of(self._struct_of_phi).size
+
+
+def _with_examples(
+    y0: Y | Callable, args: Args | Callable, key: PRNGKeyArray, caller: str
+) -> tuple[Y, Callable | None, Args, Callable | None]:
+    """The fields `y0`, `y0_of`, `args` and `args_of` of a `Problem`, of which `y0_of` is
+    still the user's function itself. Examples may be drawn from any key, since all draws
+    have the same structure."""
+    args_of = args if callable(args) else None
+    if args_of is not None:
+        args = drawn_args(args_of, key)
+        args_of = traced(ft.partial(drawn_args, args_of), key, identity=args_of)
+    else:
+        check_args(args)
+    y0_of = y0 if callable(y0) else None
+    y0 = given_state(y0) if y0_of is None else drawn_state(y0_of, key, args)
+    check_state(caller, y0)
+    is_finite = all(np.all(np.isfinite(leaf)) for leaf in jtu.tree_leaves(y0))
+    if y0_of is None and not is_finite:
+        raise ValueError(f"`y0` must hold finite numbers; got {brief(y0)}.")
+    return y0, y0_of, args, args_of
+
+
+def _as_programs(
+    phi: Callable,
+    terms: PyTree[diffrax.AbstractTerm],
+    solver: diffrax.AbstractSolver,
+    y0_of: Callable | None,
+    t0: np.ndarray,
+    y0: Y,
+    args: Args,
+    key: PRNGKeyArray,
+) -> tuple:
+    """Returns `phi`, `terms`, `solver`, `y0_of` and `args`, with a program (see
+    `_programs`) in place of each function of the user.
+
+    In `args`, an array takes the place of each Python float, so that other numbers compile
+    nothing anew. But if a function of the user needs the numbers themselves, for example in
+    an `if`, `args` stay as they are.
+    """
+
+    def programs_for(args: Args) -> tuple:
+        draw_y0 = None
+        if y0_of is not None:
+            draw = ft.partial(drawn_state, y0_of)
+            draw_y0 = traced(draw, key, args, identity=y0_of)
+        return (
+            traced_phi(phi, terms, t0, y0, args),
+            with_programs(terms, t0, y0, args),
+            with_programs(solver, t0, y0, args),
+            draw_y0,
+            args,
+        )
+
+    def float_as_array(x: Any) -> Any:
+        # Integers are kept, since they may be exponents or sizes.
+        return jnp.asarray(x) if type(x) is float else x
+
+    try:
+        return programs_for(jtu.tree_map(float_as_array, args))
+    except (ValueError, *NEED_VALUES):
+        # The second attempt is not made in here, since Python would print its error
+        # together with this one.
+        pass
+    return programs_for(args)
 
 
 @once_for_each_signature
@@ -383,19 +416,19 @@ def _struct_of_phi(
     y0: Y,
     args: Args,
 ) -> PyTree[jax.ShapeDtypeStruct]:
-    """The shapes and dtypes of `phi`."""
+    """The values of `phi`, with a shape and dtype in place of each array."""
     return jax.eval_shape(lambda: phi(t0, y0, args))
 
 
 def _order_of(solver: diffrax.AbstractSolver, terms: PyTree) -> int | float:
-    """The weak order of a solver. Solvers of other packages have no `weak_order`, and
-    solvers of the user may not state theirs: it counts as 1."""
+    """The weak order of a solver for these terms. It counts as 1 for solvers of other
+    packages, which have no `weak_order`, and for solvers of the user that return `None`."""
     return getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
 
 
 def advice_on_failures(problem: Problem | None) -> str:
-    """What to do about failed paths of a problem, or of a function of the user for `None`,
-    in sentences for messages."""
+    """Tells users, in sentences for a message, what to do about failed paths. `problem` is
+    `None` for `monte_carlo`, which averages any function of the user."""
     no_solution = ""
     alternative = " or bounded increments, as from a `WeakBrownianPath`,"
     if problem is not None:
@@ -417,11 +450,11 @@ def advice_on_failures(problem: Problem | None) -> str:
 
 
 def ravel(y: Y) -> Float[Array, " d"]:
-    """The leaves as one vector."""
+    """The leaves of a state as one vector."""
     return jfu.ravel_pytree(y)[0]
 
 
 def real_vector(tree: PyTree) -> Float[Array, " m"]:
-    """The leaves as one vector of real numbers."""
+    """The leaves of a PyTree as one vector of floating-point numbers."""
     x = ravel(tree)
     return x.astype(jnp.result_type(x, float))

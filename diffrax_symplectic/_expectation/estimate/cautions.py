@@ -1,4 +1,4 @@
-"""What users are warned of in an estimate."""
+"""The warnings that users get about an estimate."""
 
 from collections.abc import Iterator
 
@@ -21,28 +21,29 @@ _HEAVY = 0.35
 # error, as for value functions with a standard error of 1e-16 beside a discretization error
 # of 1e-7.
 _NEGLIGIBLE_STD_ERRORS = 100
-# Two steps do not agree if the extrapolation from them changes the mean by more than this
-# share of it. For a method of order 2, the bias of the longer step is four times this
-# change, and thus more than twice the mean.
+# Two steps do not agree if the extrapolation from them changes the mean by more than each
+# of three bounds. The first is this share of the mean. (For a method of order 2, the bias
+# of the longer step is four times the change, and thus more than twice the mean.)
 _LARGE_SHARE_OF_MEAN = 0.5
-# The change must also be more than this share of the standard deviation of a path: any
-# change is large beside a mean of about zero.
-_LARGE_SHARE_OF_SPREAD = 0.05
-# The change must also be more than this many of its standard errors: by chance it is more
-# once in sixteen thousand times.
+# The second is this share of the standard deviation of a path, since any change is large
+# beside a mean of about zero.
+_LARGE_SHARE_OF_DEVIATION = 0.05
+# The third is this many standard errors of the change, which it exceeds by chance once in
+# sixteen thousand times.
 _STD_ERRORS_TO_BE_SURE = 4
 # If this many times as many paths fail with the longer step as with half of it, they fail
-# because it is too long, and not for another reason.
+# because the longer step is too long, and not for another reason.
 _MANY_TIMES_MORE = 10
 
 
 def cautions(estimate: Expectation, tol: float | None, advice: str) -> Iterator[str]:
-    """The warnings for an estimate. `advice` is what to do about failed paths, in
-    sentences."""
+    """The warnings for an estimate. The warning of failed paths ends with `advice`, which
+    says in sentences what to do about them."""
     if estimate.num_failed > 0:
         yield from _cautions_on_failures(estimate, advice)
     if estimate.num_samples > 1:
         yield from _cautions_on_mean(estimate)
+        yield from _cautions_on_tails(estimate)
         yield from _cautions_on_samples(estimate)
         yield from _cautions_on_steps(estimate)
     if tol is not None and not estimate.tol_reached:
@@ -52,7 +53,7 @@ def cautions(estimate: Expectation, tol: float | None, advice: str) -> Iterator[
 def _cautions_on_failures(estimate: Expectation, advice: str) -> Iterator[str]:
     """Warns of failed paths that could change the mean by more than its standard error."""
     vectors = estimate.vectors
-    # Without samples both are NaN, so this is false.
+    # Without samples both errors are NaN, so the comparison is false.
     if np.all(vectors.failed_error <= vectors.std_error):
         return
     if estimate.num_samples == 0:
@@ -70,14 +71,15 @@ def _cautions_on_failures(estimate: Expectation, advice: str) -> Iterator[str]:
                 f"; the first two steps do not agree, since {num_with_dt0:,} paths fail "
                 f"with steps of `dt0` and {num_with_half:,} with half of it"
             )
-            # Where most paths fail, `advice` speaks of the steps already.
+            # Where most paths fail, the caller's `advice` speaks of the steps already.
             if estimate.num_failed <= estimate.num_paths:
                 advice = f"Pass a smaller `dt0`. {advice}"
     yield f"{estimate.num_failed:,} paths failed: {consequence}. {advice}"
 
 
 def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
-    """Warns of a mean or a standard error that cannot be trusted."""
+    """Warns of means or standard errors that are not finite, and of a control variate that
+    was dropped."""
     vectors = estimate.vectors
     if not np.all(np.isfinite([vectors.mean, vectors.std_error])):
         yield (
@@ -93,13 +95,19 @@ def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
             "Pass a smaller `degree`, or another `sampling`."
         )
 
+
+def _cautions_on_tails(estimate: Expectation) -> Iterator[str]:
+    """Warns if a single path accounts for so much of the variance that the standard error
+    cannot be trusted."""
+    vectors = estimate.vectors
+    heaviness = combined_results(estimate, Combination.BEST).heaviness
     matters = _NEGLIGIBLE_STD_ERRORS * vectors.std_error >= vectors.error
-    # Zero where it does not matter.
-    heaviness = best.heaviness * matters
-    heaviest = int(np.argmax(np.nan_to_num(heaviness)))
-    r = heaviness[heaviest]
+    # Zero where heavy tails do not matter.
+    relevant_heaviness = np.nan_to_num(heaviness * matters)
+    heaviest = int(np.argmax(relevant_heaviness))
+    r = relevant_heaviness[heaviest]
     if r > _HEAVY:
-        # For sorted paths, `r` is that of the paths of one replicate.
+        # For replicates of many paths, `r` is that of the paths of one replicate.
         is_replicate = estimate.paths_per_sample > 1
         num_paths = estimate.paths_per_sample if is_replicate else estimate.num_samples
         share = share_of_largest(r, num_paths)
@@ -115,14 +123,15 @@ def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
 def _cautions_on_samples(estimate: Expectation) -> Iterator[str]:
     """Warns of samples that are all zero, or all equal."""
     moments = total(estimate.moments)
-    # Without the control variate. With it, a sample is not zero where `phi` is.
+    # The largest absolute values of `phi`. (With a control variate, a sample is not zero
+    # where `phi` is.)
     largest_values = moments.size.without_control[Combination.BEST]
     arrays = jtu.tree_leaves(estimate.layout.unravel(largest_values))
     # The smallest number whose rounding errors do not underflow.
     precision = jnp.finfo(estimate.dtype)
     smallest = float(precision.tiny / precision.eps)
-    # An array of `phi` must be zero as a whole: a single entry may well be, such as that of
-    # a momentum at the start.
+    # Users are warned only if an array of `phi` is zero as a whole. A single entry may well
+    # be zero, such as a momentum at the start.
     if any(np.max(array) < smallest for array in arrays):
         yield (
             f"An output of `phi` is zero, or underflows {estimate.dtype}, on all paths. If "
@@ -141,30 +150,35 @@ def _cautions_on_samples(estimate: Expectation) -> Iterator[str]:
 
 
 def _cautions_on_steps(estimate: Expectation) -> Iterator[str]:
-    """Warns of two steps whose means differ much. (Three are checked for the order.)"""
+    """Warns of two steps whose means differ much. (With three or more,
+    `Expectation.off_order` tells whether the steps are too long.)"""
     if estimate.levels != 2:
         return
     vectors = estimate.vectors
-    best = combined_results(estimate, Combination.BEST)
-    change = combined_results(estimate, Combination.EXTRAPOLATION)
+    # The means with the smaller step.
     finest = vectors.mean + vectors.bias
+    change = combined_results(estimate, Combination.EXTRAPOLATION)
     size_of_change = np.abs(change.mean)
-    moments = total(estimate.moments)
-    # The largest absolute values of samples, by which their rounding is measured.
-    size = np.fmax(moments.size.value, moments.size.without_control)[Combination.BEST]
-    rounding = ROUNDING * float(jnp.finfo(estimate.dtype).eps) * size
     noise = _STD_ERRORS_TO_BE_SURE * change.std_error
-    # The standard deviation of a path, or for sorted paths a number that is not above it.
-    spread = best.plain_s
-    if estimate.paths_per_sample > 1:
-        spread = least_deviation(best.spread, best.heaviness, estimate.paths_per_sample)
+    # Rounding errors are in proportion to the largest absolute values of samples.
+    sizes = total(estimate.moments).size
+    size = np.fmax(sizes.value, sizes.without_control)[Combination.BEST]
+    rounding = ROUNDING * float(jnp.finfo(estimate.dtype).eps) * size
+    # The standard deviation of a path.
+    best = combined_results(estimate, Combination.BEST)
+    deviation = best.plain_s
+    num_paths = estimate.paths_per_sample
+    if num_paths > 1:
+        # A sample is a mean over many paths. The deviation of one path is at least this.
+        deviation = least_deviation(best.max_deviation, best.heaviness, num_paths)
     is_real = size_of_change > np.maximum(noise, rounding)
-    is_large = size_of_change > _LARGE_SHARE_OF_MEAN * np.abs(finest)
-    is_seen = size_of_change > _LARGE_SHARE_OF_SPREAD * spread
+    is_large_for_mean = size_of_change > _LARGE_SHARE_OF_MEAN * np.abs(finest)
+    is_large_for_path = size_of_change > _LARGE_SHARE_OF_DEVIATION * deviation
+    disagrees = is_real & is_large_for_mean & is_large_for_path
     # The mean may be zero.
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = size_of_change / np.abs(finest)
-    ratios_to_tell = np.nan_to_num(np.where(is_real & is_large & is_seen, ratios, 0))
+    ratios_to_tell = np.nan_to_num(np.where(disagrees, ratios, 0))
     worst = int(np.argmax(ratios_to_tell))
     if ratios_to_tell[worst] > 0:
         yield (

@@ -1,4 +1,4 @@
-"""Estimates of expectations, with error bars from the moments of the samples."""
+"""`Expectation`: an estimate with error bars, from the moments of its samples."""
 
 import dataclasses
 import math
@@ -46,13 +46,13 @@ class Expectation(eqx.Module):
     `layout`, `dtype`, `paths_per_sample`, `rounding_floor`, `digests` and `caveat`.
     """
 
-    # The moments of batches, with neighbours combined.
+    # The moments of batches, after `combined_in_halves`.
     moments: tuple[Moments, ...]
     key_data: np.ndarray
-    # How the numbers of the moments make PyTrees like `phi`, and in which precision they
-    # were computed.
+    # How the numbers of the moments make PyTrees like `phi`.
     layout: Layout = eqx.field(static=True)
     levels: int
+    # The dtype in which samples were computed. (Moments are in float64.)
     dtype: str
     paths_per_sample: int = 1
     # The smallest standard error, in units of the rounding of the mean.
@@ -60,9 +60,10 @@ class Expectation(eqx.Module):
     sampling: Any = None
     reason: str = ""
     tol_reached: bool | None = None
-    # What the checks of the step could not see, in words.
+    # What the checks of the step size could not see, in words.
     caveat: str = ""
-    # What tells this estimate from those of other arguments, by the names of these.
+    # A hash of each argument, by its name, so that `check_same` can tell estimates from
+    # other arguments. `None` if there are none, as in files of earlier versions.
     digests: dict[str, str] | None = None
     ts: np.ndarray | None = None
 
@@ -80,7 +81,7 @@ class Expectation(eqx.Module):
 
     @property
     def failed_on(self) -> tuple[int, ...]:
-        """The number of paths that failed on each level."""
+        """The number of paths that failed on each level, the coarsest level first."""
         return total(self.moments).failed_on
 
     @property
@@ -88,6 +89,7 @@ class Expectation(eqx.Module):
         ranges: list[tuple[int, int]] = []
         for part in self.moments:
             begin = part.begin
+            # A part that begins where the last range ends makes that range longer.
             if ranges and ranges[-1][1] == begin:
                 begin, _ = ranges.pop()
             ranges.append((begin, part.end))
@@ -109,10 +111,10 @@ class Expectation(eqx.Module):
         r = \frac{(M - s \sqrt{4.5 \log n})_+}{s \sqrt n}, $$
 
         where $M$ is the largest deviation from the mean. $M$ exceeds
-        $s \sqrt{4.5 \log n}$ only for heavy tails, and $r = 1$ if a single sample accounts
-        for all of the variance. (For sorted paths, $r$ is also computed for the paths
-        within a replicate, and the larger value is used.) The standard error is never less
-        than the rounding of the mean."""
+        $s \sqrt{4.5 \log n}$ only for heavy tails, and $r$ is near 1 if a single sample
+        accounts for all of the variance. (For sorted paths, $r$ is also computed for the
+        paths within a replicate, and the larger value is used.) The standard error is never
+        less than the rounding of the mean."""
         return self._tree(self.vectors.std_error)
 
     @property
@@ -135,8 +137,8 @@ class Expectation(eqx.Module):
     @property
     def error(self) -> _Host:
         """The error of `mean`, which is printed after it: the root of the sum of squares of
-        `std_error`, `failed_error` and `discretization_error`. (With one level this last
-        one is unknown, and not included.)"""
+        `std_error`, `failed_error` and `discretization_error`. (With one level the
+        discretization error is unknown, and not included.)"""
         return self._tree(self.vectors.error)
 
     @property
@@ -144,38 +146,45 @@ class Expectation(eqx.Module):
         r"""What remains of the discretization error in `mean`: the change by the last
         extrapolation; `None` with one level.
 
-        With two levels this is the bias that the extrapolation removed from the finer one,
-        which is more than what remains wherever the order of the solver shows. It does not
-        show where steps are too long, and two levels cannot tell. With three levels, the
-        changes of the mean by the two halvings of the step are compared: for a method of
-        order $p$ the last one should be $2^{-p}$ of the one before. If it is less than a
-        quarter of that, or more than four thirds, by more than two standard errors, then
-        the larger of these changes is taken instead, and the printed estimate says so. With
-        $L > 3$ levels the same holds for the extrapolations from $L - 2$ neighbouring
-        levels, of order $p + L - 3$. The order $p + L - 2$ of the last extrapolation is not
-        checked. So its change is taken for at least as large as if it were of order $p$,
-        less two standard errors."""
+        With two levels the change is the bias that the extrapolation removed from the finer
+        level. The change is more than what remains wherever the error decreases by the
+        order of the solver. With steps that are too long it may be less, and two levels
+        cannot tell.
+
+        With three levels, the changes of the mean by the two halvings of the step are
+        compared: for a method of order $p$ the second change should be $2^{-p}$ of the
+        first. It does not fit the order if it is less than a quarter of this prediction, or
+        more than four thirds, by more than two standard errors. Then the larger of the two
+        changes is taken instead, and the printed estimate says so.
+
+        With $L > 3$ levels the same holds for the extrapolations from $L - 2$ neighbouring
+        levels, of order $p + L - 3$, in place of the means on single levels.
+
+        With three levels or more, the order $p + L - 2$ of the last extrapolation is not
+        checked. So its change is taken for at least as large as if the extrapolation were
+        of order $p$, less two standard errors."""
         return self._tree(self.vectors.discretization_error)
 
     @property
     def failed_error(self) -> _Host:
         """What failed paths could change in `mean`: their fraction of all paths, times the
-        largest deviation of another path's value from the mean. (For sorted paths, that is
-        the mean over the replicates.) It does not decrease with more paths, and is NaN if
-        there is no other path."""
+        largest deviation of another path's value from the mean. (For sorted paths, this
+        deviation is averaged over the replicates.) `failed_error` does not decrease with
+        more paths, and is NaN if all paths failed."""
         return self._tree(self.vectors.failed_error)
 
     @property
     def off_order(self) -> PyTree[np.ndarray] | None:
-        """Whether the changes of the mean from step to step do not fit the order, as in
-        `discretization_error`; `None` with fewer than three levels."""
+        """Whether the changes of the mean by halved steps do not fit the order of the
+        solver, as `discretization_error` explains; `None` with fewer than three levels."""
         return self._tree(self.vectors.off_order)
 
     def interval(self, confidence: float = 0.95) -> tuple[_Host, _Host]:
         """The ends of a confidence interval: `mean` plus and minus `error` times the
-        quantile of Student's $t$ with `num_samples - 1` degrees of freedom. (For 95% this
-        is 2.13 with 16 samples, and 1.96 with very many.) Where sampling is a small part of
-        `error` the interval holds the mean more often than that.
+        quantile of Student's $t$ with `num_samples - 1` degrees of freedom. (For 95% the
+        quantile is 2.13 with 16 samples, and 1.96 with very many.) If the standard error is
+        a small part of `error`, the interval holds the expectation more often than
+        `confidence` says.
 
         **Raises:** a `ValueError` unless `confidence` is a number between 0 and 1.
         """
@@ -230,9 +239,9 @@ class Expectation(eqx.Module):
 
     def save(self, file: str | Path | BinaryIO) -> None:
         """Writes the estimate to a NumPy `.npz` file, which `Expectation.load` reads. An
-        older file is replaced by the whole new one, or if anything fails kept as it is.
-        $\\phi$ must be made of dictionaries, lists, tuples and arrays. Functions in
-        `sampling`, such as `sort_by`, are not saved."""
+        older file at the same path is replaced only by a complete new one: if anything
+        fails, the older file is kept. $\\phi$ must be made of dictionaries, lists, tuples
+        and arrays. Functions in `sampling`, such as `sort_by`, are not saved."""
         _check_file(file, "write")
         write(file, *contents_of(self))
 
@@ -240,9 +249,9 @@ class Expectation(eqx.Module):
     def load(file: str | Path | BinaryIO) -> "Expectation":
         """Reads an estimate written by `save`. No code from the file is executed.
 
-        **Raises:** a `ValueError` for a file that is damaged or another, and for a sampling
-        that this version does not have. Warns of a file without the digests by which
-        `merge` and `start=` tell the arguments of estimates.
+        **Raises:** a `ValueError` for a file that is damaged or not from `save`, and for a
+        sampling that this version does not have. Warns of a file without the digests by
+        which `merge` and `start=` tell the arguments of estimates.
         """
         _check_file(file, "read")
         if isinstance(file, str | Path):
@@ -253,7 +262,7 @@ class Expectation(eqx.Module):
         except OtherVersion:
             raise
         except Exception:
-            # There are as many kinds of errors as of damage.
+            # Damage may show as any kind of error.
             raise ValueError(
                 f"{getattr(file, 'name', 'The file')} is damaged, or was not written by "
                 "`Expectation.save`."
@@ -269,7 +278,8 @@ class Expectation(eqx.Module):
                 "is taken for the error (take smaller steps)"
             )
         plural = "" if self.levels == 1 else "s"
-        # With `tol` the size of the sampling is an upper limit, which tells nothing.
+        # With `tol` the number of paths in the sampling is an upper limit, which does not
+        # say how many were taken.
         sampling = self.sampling
         if self.tol_reached is not None:
             sampling = f"{type(self.sampling).__name__} until `tol`"
@@ -289,20 +299,19 @@ class Expectation(eqx.Module):
 
     def _lines_of_means(self) -> list[str]:
         """A line for each number of the mean, such as `t=2, ['energy'][0]: 0.364083 ±
-        8.6e-05 (sampling 5.1e-05, discretization 6.9e-05)`: its time and its place in the
-        PyTree, if there are several, the number, its error, and the parts of the error, if
-        there are several."""
+        8.6e-05 (sampling 5.1e-05, discretization 6.9e-05)`: the label of the number (see
+        `Layout.labels`) unless it is empty, the number, its error, and in brackets the
+        parts of the error if there are several."""
         vectors = self.vectors
         errors_by_source = {"sampling": vectors.std_error}
         if vectors.discretization_error is not None:
             errors_by_source["discretization"] = vectors.discretization_error
         if self.num_failed > 0:
             errors_by_source["failed paths"] = vectors.failed_error
-        means = vectors.mean
         errors = vectors.error
         lines = []
         for k, label in enumerate(self.layout.labels(self.ts)):
-            line = f"{_rounded(means[k], errors[k])} ± {errors[k]:.1e}"
+            line = f"{_rounded(vectors.mean[k], errors[k])} ± {errors[k]:.1e}"
             if len(errors_by_source) > 1:
                 sources = [f"{name} {x[k]:.1e}" for name, x in errors_by_source.items()]
                 line += f" ({', '.join(sources)})"
@@ -311,18 +320,11 @@ class Expectation(eqx.Module):
 
     @property
     def vectors(self) -> "Vectors":
-        """All results, each as a vector of all numbers of `phi`."""
+        """The results that users see as properties, as vectors of all numbers of `phi`."""
         results = _results_of(self)
         best = results.of_combination(Combination.BEST)
-        num_drawn = sum(part.end - part.begin for part in self.moments)
-        # A sample of one path is left out if the path fails. A replicate leaves out its
-        # failed paths, which are counted here as a fraction of a sample.
-        num_left_out = num_drawn - self.num_samples
-        num_lost = max(num_left_out, self.num_failed / self.paths_per_sample)
-        fraction = num_lost / max(num_drawn, 1) if self.num_samples > 0 else np.nan
-        vectors = Vectors(
-            best.mean, best.std_error, best.variance, fraction * best.spread
-        )
+        failed_error = self._failed_fraction * best.max_deviation
+        vectors = Vectors(best.mean, best.std_error, best.variance, failed_error)
         if self.levels == 1:
             return vectors
         error, off_order = discretization_error(results, self.levels)
@@ -333,18 +335,29 @@ class Expectation(eqx.Module):
             off_order=off_order,
         )
 
+    @property
+    def _failed_fraction(self) -> float:
+        """The fraction of all samples that failed; NaN without good samples."""
+        if self.num_samples == 0:
+            return np.nan
+        num_drawn = sum(part.end - part.begin for part in self.moments)
+        # A sample of one path is not good if the path fails. A replicate of many paths
+        # leaves out its failed paths, which count as a fraction of a sample.
+        num_failed = self.num_failed / self.paths_per_sample
+        return max(num_drawn - self.num_samples, num_failed) / num_drawn
+
     def _tree(self, x: np.ndarray | None) -> Any:
         """The numbers of a vector in the structure of `phi`; `None` for `None`."""
         if x is None:
             return None
-        # This turns arrays without axes into numbers.
+        # The index `()` turns an array without axes into a number.
         return jtu.tree_map(lambda leaf: leaf[()], self.layout.unravel(x))
 
 
 class Vectors(NamedTuple):
-    """Results of an `Expectation`, under the same names, each as a vector of all numbers of
-    `phi`. With one level `bias`, `bias_std_error` and `discretization_error` are `None`,
-    and with fewer than three levels `off_order` is."""
+    """The properties of an `Expectation` with the same names, each as a vector of all
+    numbers of `phi`. The fields from `bias` to `discretization_error` are `None` with one
+    level, and `off_order` is `None` with fewer than three."""
 
     mean: np.ndarray
     std_error: np.ndarray
@@ -364,17 +377,18 @@ class Vectors(NamedTuple):
 
     @property
     def is_off_order(self) -> bool:
-        """Whether any mean does not fit the order."""
+        """Whether the changes of any mean do not fit the order of the solver."""
         return self.off_order is not None and bool(np.any(self.off_order))
 
 
 def _results_of(estimate: Expectation) -> Results:
-    """The results for all combinations of levels."""
+    """The results of an estimate for all combinations of levels."""
     return results_of(total(estimate.moments), estimate.dtype, estimate.rounding_floor)
 
 
 def _check_file(file: Any, method: str) -> None:
-    """Raises a `ValueError` unless this is a path, or has the method of an open file."""
+    """Raises a `ValueError` unless `file` is a path, or an open file with this method,
+    `"read"` or `"write"`."""
     if not isinstance(file, str | Path) and not hasattr(file, method):
         raise ValueError(
             f"`file` must be a path, or a file that is open in binary mode; got {file!r}."
@@ -382,20 +396,21 @@ def _check_file(file: Any, method: str) -> None:
 
 
 def combined_results(estimate: Expectation, combination: Combination) -> Results:
-    """All results for a combination of levels, of which users see some as properties."""
+    """The results of an estimate for one combination of levels."""
     return _results_of(estimate).of_combination(combination)
 
 
 def check_same(one: Expectation, other: Expectation, name: str) -> None:
-    """Raises a `ValueError` if the estimates come from different arguments, have different
-    keys or shapes, or numbers of paths in a sample. `name` is what messages call one of
-    them, such as "`start`"."""
-    # Among the arguments that both estimates know.
-    digests = other.digests or {}
+    """Raises a `ValueError` unless two estimates may be parts of one: with the same
+    arguments, key, shapes, levels, and number of paths in a sample. `name` is what messages
+    call one of the two, such as "`start`"."""
+    # Estimates from some files have no digests. Only arguments that both have are compared.
+    digests = one.digests or {}
+    other_digests = other.digests or {}
     different = [
         f"`{argument}`"
-        for argument, value in (one.digests or {}).items()
-        if digests.get(argument, value) != value
+        for argument in digests
+        if argument in other_digests and digests[argument] != other_digests[argument]
     ]
     if different:
         raise ValueError(
@@ -423,8 +438,8 @@ def check_same(one: Expectation, other: Expectation, name: str) -> None:
 
 
 def label_of(estimate: Expectation, place: int) -> str:
-    """Which number of the mean stands at this place, in brackets; the empty string for a
-    single number."""
+    """The label of the number of the mean with index `place`, for messages: in brackets
+    after a blank, such as ` (t=2, [0])`. It is empty if the mean is a single number."""
     label = estimate.layout.labels(estimate.ts)[place]
     return f" ({label})" if label else ""
 
@@ -435,15 +450,15 @@ def _rounded(mean: float, error: float) -> str:
     if not (np.isfinite(mean) and 0 < error < np.inf):
         return f"{mean:.6g}"
     exponent = _exponent(max(abs(mean), error))
-    # The place of the last digit. Beyond the fifteenth, float64 has none.
-    place = max(_exponent(error) - 1, exponent - 15)
+    # The exponent of the last digit. Beyond the fifteenth digit, float64 has none.
+    last_exponent = max(_exponent(error) - 1, exponent - 15)
     # The sum makes a negative zero positive.
-    rounded = round(mean, -place) + 0.0
+    rounded = round(mean, -last_exponent) + 0.0
     if -5 < exponent < 7:
-        return f"{rounded:.{max(-place, 0)}f}"
+        return f"{rounded:.{max(-last_exponent, 0)}f}"
     if rounded == 0:
         return "0"
-    return f"{rounded:.{max(_exponent(abs(rounded)) - place, 0)}e}"
+    return f"{rounded:.{max(_exponent(abs(rounded)) - last_exponent, 0)}e}"
 
 
 def _exponent(size: float) -> int:

@@ -1,4 +1,4 @@
-"""Means and variances of batches of samples, and how they are combined."""
+"""Means and deviations of batches of samples, and how batches are combined."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -10,16 +10,21 @@ from ..sampling import Averaged
 
 
 class Moments(NamedTuple):
-    """Statistics of samples `begin` to `end - 1`, on the host and in float64.
+    """Statistics of the samples with numbers from `begin` to `end - 1`, on the host.
 
-    - `num_good`: the number of good samples.
-    - `num_failed`: the number of failed paths, each counted once.
+    - `num_good`: the number of good samples. The sample of a path is good if the path did
+        not fail; a replicate of many paths is good unless on some level all of them failed.
+    - `num_failed`: the number of failed paths. A path that fails on several levels counts
+        once.
     - `failed_on`: the number of paths that failed on each level.
-    - `mean`: the mean of the good samples. Arrays have axes for combinations of levels and
-        numbers.
+
+    The other fields are statistics of the good samples, as arrays in float64 with axes for
+    combinations of levels and for all numbers of `phi`:
+
+    - `mean`: the mean.
     - `norm`: the root of the sum of squared deviations from the mean. (The sum itself would
         overflow or underflow sooner.)
-    - `largest`: the largest deviation within a batch.
+    - `largest`: the largest deviation of a sample from the mean of its batch.
     - `size`: the largest absolute value.
     """
 
@@ -35,12 +40,12 @@ class Moments(NamedTuple):
 
 
 def combined_in_halves(parts: Iterable[Moments]) -> tuple[Moments, ...]:
-    """The moments of the same samples in fewer parts: two neighbours that are halves of one
-    range become one, again and again, in the way a binary counter carries. `parts` are in
-    the order of their samples.
+    """The moments of the same samples in fewer parts, since an estimate of many batches
+    should keep a few parts only. `parts` are in the order of their samples.
 
-    The result is the same if some of the parts were combined before, so it does not depend
-    on the order in which batches are computed, and only a few parts remain.
+    Two neighbours that are the halves of one range become one part, again and again, in the
+    way a binary counter carries. So samples are always combined in the same pairs, and the
+    result is bitwise the same in whatever order batches were computed and combined before.
     """
     combined_parts: list[Moments] = []
     for part in parts:
@@ -53,7 +58,7 @@ def combined_in_halves(parts: Iterable[Moments]) -> tuple[Moments, ...]:
 
 
 def total(parts: tuple[Moments, ...]) -> Moments:
-    """The moments of all samples of one part or more."""
+    """The moments of the samples of all parts together."""
     whole, *rest = parts
     for part in rest:
         whole = _moments_of_both(whole, part)
@@ -77,14 +82,14 @@ def _moments_of_both(a: Moments, b: Moments) -> Moments:
     # The sum of squared deviations of all samples is that of `a`, plus that of `b`, plus
     # `weight**2` times the squared difference of their means.
     weight = np.sqrt(a.num_good / n * b.num_good)
-    difference = jtu.tree_map(np.subtract, b.mean, a.mean)
+    differences = jtu.tree_map(np.subtract, b.mean, a.mean)
 
-    def mean(of_a, of_b, difference):
+    def mean_of_both(mean_of_a, mean_of_b, difference):
         # Without good samples the mean of `a` is a placeholder.
-        return of_b if a.num_good == 0 else of_a + difference * share_of_b
+        return mean_of_b if a.num_good == 0 else mean_of_a + difference * share_of_b
 
-    def norm(of_a, of_b, difference):
-        return np.hypot(np.hypot(of_a, of_b), weight * difference)
+    def norm_of_both(norm_of_a, norm_of_b, difference):
+        return np.hypot(np.hypot(norm_of_a, norm_of_b), weight * difference)
 
     return Moments(
         begin=a.begin,
@@ -92,8 +97,8 @@ def _moments_of_both(a: Moments, b: Moments) -> Moments:
         num_good=a.num_good + b.num_good,
         num_failed=a.num_failed + b.num_failed,
         failed_on=tuple(map(sum, zip(a.failed_on, b.failed_on))),
-        mean=jtu.tree_map(mean, a.mean, b.mean, difference),
-        norm=jtu.tree_map(norm, a.norm, b.norm, difference),
+        mean=jtu.tree_map(mean_of_both, a.mean, b.mean, differences),
+        norm=jtu.tree_map(norm_of_both, a.norm, b.norm, differences),
         largest=jtu.tree_map(np.maximum, a.largest, b.largest),
         size=jtu.tree_map(np.maximum, a.size, b.size),
     )

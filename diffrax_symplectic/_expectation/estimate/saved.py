@@ -1,4 +1,5 @@
-"""Estimates in files: arrays, and their structure as JSON."""
+"""Estimates in NumPy `.npz` files: arrays, and a header in JSON with all that is no array,
+such as numbers, words and the structure of `phi`."""
 
 import dataclasses
 import io
@@ -20,9 +21,9 @@ from ..sampling import Averaged, MOST_SAMPLES, SAVED_SAMPLINGS
 from .moments import Moments
 
 
-# The fields of `Moments` that are an `Averaged`.
+# The fields of `Moments` that are an `Averaged`. Each is one array of a file.
 _AVERAGED = ("mean", "norm", "largest", "size")
-# The fields of an estimate that JSON takes as they are.
+# The fields of an `Expectation` that are written to the header as they are.
 _FIELDS_OF_ESTIMATE = (
     "levels",
     "dtype",
@@ -36,60 +37,62 @@ _FIELDS_OF_ESTIMATE = (
 
 
 class OtherVersion(ValueError):
-    """An estimate was written by a version that had more than this one."""
+    """Raised for an estimate with a sampling that this version does not have."""
 
 
 def write(
     file: str | Path | BinaryIO, header: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> None:
-    """Writes a NumPy `.npz` file of arrays and a header. A file that is there already is
-    replaced by the whole new one, or if anything fails kept as it is."""
+    """Writes a NumPy `.npz` file of arrays and a header. A file at the same path is
+    replaced only by a complete new one: if anything fails, the older file is kept."""
     arrays = {**arrays, "header": np.array(json.dumps(header))}
     if not isinstance(file, str | Path):
         np.savez(file, **arrays)  # pyright: ignore
         return
     path = Path(file).resolve()
-    # Several processes may save to one path.
-    beside = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
+    # The part of the name in hexadecimal digits is random, since several processes may save
+    # to one path at the same time.
+    unfinished = path.with_name(f"{path.name}.{secrets.token_hex(4)}.part")
     try:
-        with open(beside, "xb") as opened:
+        with open(unfinished, "xb") as opened:
             np.savez(opened, **arrays)  # pyright: ignore
             opened.flush()
             os.fsync(opened.fileno())
-        os.replace(beside, path)
+        os.replace(unfinished, path)
     finally:
-        beside.unlink(missing_ok=True)
+        unfinished.unlink(missing_ok=True)
 
 
 def read(file: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The header and the arrays of a file that `write` wrote. Raises any error for another
-    file."""
+    """The header and the arrays of a file that `write` wrote. For any other file it may
+    raise any error."""
     arrays = {}
     with zipfile.ZipFile(file) as archive:
         for name in archive.namelist():
-            # This compares checksums, before anything is taken for an array.
+            # `read` compares checksums, before anything is taken for an array.
             content = io.BytesIO(archive.read(name))
-            # Objects are refused, so that no code is executed.
+            # Without pickles no code of the file is executed.
             array = np.lib.format.read_array(content, allow_pickle=False)
             arrays[name.removesuffix(".npy")] = array
     return json.loads(str(arrays.pop("header"))), arrays
 
 
 def contents_of(estimate: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """The arrays of an `Expectation` (whose module imports this one), and all else of it,
-    for JSON. Raises a `ValueError` for PyTree nodes that JSON cannot express."""
+    """The header and the arrays of a file, from an `Expectation` (whose module imports this
+    one). Raises a `ValueError` for PyTree nodes in `phi` that JSON cannot express."""
     layout = estimate.layout
     sampling = estimate.sampling
-    # A function, such as `sort_by`, is left out. Integers may be those of NumPy.
-    fields_of_sampling = {
-        name: int(x) if isinstance(x, np.integer) else x
-        for name, x in ({} if sampling is None else vars(sampling)).items()
-        if x is None or isinstance(x, int | float | str | np.integer)
-    }
+    # Functions in a sampling, such as `sort_by`, are left out.
+    fields_of_sampling = {}
+    for name, x in ({} if sampling is None else vars(sampling)).items():
+        if isinstance(x, np.integer):
+            fields_of_sampling[name] = int(x)
+        elif x is None or isinstance(x, int | float | str):
+            fields_of_sampling[name] = x
     structs = [jax.ShapeDtypeStruct(shape, float) for shape in layout.shapes]
-    # All batches have the same fields.
+    # All parts have the same fields of `Averaged`.
     first, *_ = estimate.moments
-    # The names here are those of the files.
+    # The names here are part of the format of files, so they must not be changed.
     header = {
         "ranges": [
             [part.begin, part.end, part.num_good, part.num_failed, part.failed_on]
@@ -102,13 +105,11 @@ def contents_of(estimate: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         "fields": fields_of_sampling,
     }
     header |= {name: getattr(estimate, name) for name in _FIELDS_OF_ESTIMATE}
-    # With axes for batches, fields, combinations of levels, and numbers.
-    arrays = {
-        name: np.array(
-            [[*getattr(part, name).fields.values()] for part in estimate.moments]
-        )
-        for name in _AVERAGED
-    }
+    arrays = {}
+    for name in _AVERAGED:
+        of_parts = [getattr(part, name).fields.values() for part in estimate.moments]
+        # (parts, fields of `Averaged`, combinations of levels, numbers)
+        arrays[name] = np.array([[*arrays_of_part] for arrays_of_part in of_parts])
     arrays["key_data"] = estimate.key_data
     if estimate.ts is not None:
         arrays["ts"] = estimate.ts
@@ -118,25 +119,47 @@ def contents_of(estimate: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 def fields_from(
     header: dict[str, Any], arrays: dict[str, np.ndarray]
 ) -> dict[str, Any]:
-    """The fields of the `Expectation` from which `contents_of` made these. Raises an
-    `OtherVersion` for an unknown sampling, and any error for contents that no estimate
-    has."""
-    fields = {name: header[name] for name in _FIELDS_OF_ESTIMATE}
+    """The inverse of `contents_of`: the fields of an `Expectation`. Raises an
+    `OtherVersion` for an unknown sampling. For contents that no estimate has it may raise
+    any error."""
     layout = Layout.of(_tree_of(header["structure"]), header["num_times"])
+    whole_number("rounding_floor", header["rounding_floor"])
+    _check(bool(jnp.finfo(header["dtype"])))
+    _check(arrays["key_data"].dtype == np.uint32)
+    moments = _moments_from(header, arrays, layout)
+    if header["digests"] is None:
+        warnings.warn(
+            "This estimate was saved without digests of its arguments: `merge` and "
+            "`start=` cannot check that others have the same.",
+            stacklevel=3,
+        )
+    fields = {name: header[name] for name in _FIELDS_OF_ESTIMATE}
+    return fields | {
+        "moments": moments,
+        "key_data": arrays["key_data"],
+        "layout": layout,
+        "sampling": _sampling_from(header),
+        # A mean at `t1` alone has no array of times.
+        "ts": arrays.get("ts"),
+    }
+
+
+def _moments_from(
+    header: dict[str, Any], arrays: dict[str, np.ndarray], layout: Layout
+) -> tuple[Moments, ...]:
+    """The moments of an estimate. Raises a `ValueError` for counts and shapes that no
+    estimate has."""
     levels = whole_number("levels", header["levels"])
     paths_per_sample = whole_number("paths_per_sample", header["paths_per_sample"])
-    whole_number("rounding_floor", header["rounding_floor"])
     names = header["averaged"]
     # More levels than three have no further combinations.
     num_combinations = len(level_weights(1, min(levels, 3)))
     shape = len(header["ranges"]), len(names), num_combinations, layout.size
-    _check(shape[0] > 0)
-    _check(bool(jnp.finfo(header["dtype"])))
-    _check(arrays["key_data"].dtype == np.uint32)
+    _check(len(header["ranges"]) > 0)
     for name in _AVERAGED:
         _check(arrays[name].shape == shape and arrays[name].dtype == np.float64)
     moments = []
-    # Batches are in order, and do not overlap.
+    # Parts are in the order of their samples, and do not overlap.
     end_before = 0
     for k, (begin, end, num_good, num_failed, failed_on) in enumerate(header["ranges"]):
         whole_number("begin", begin, end_before)
@@ -150,47 +173,35 @@ def fields_from(
         averaged = {
             name: Averaged(**dict(zip(names, arrays[name][k]))) for name in _AVERAGED
         }
-        # JSON has lists only.
+        # JSON has made a list of the tuple `failed_on`.
         counts = begin, end, num_good, num_failed, tuple(failed_on)
         moments.append(Moments(*counts, **averaged))
         end_before = end
-    if header["digests"] is None:
-        warnings.warn(
-            "This estimate was saved without digests of its arguments: `merge` and "
-            "`start=` cannot check that others have the same.",
-            stacklevel=3,
-        )
-    return fields | {
-        "moments": tuple(moments),
-        "key_data": arrays["key_data"],
-        "layout": layout,
-        "sampling": _sampling_from(header),
-        # There are none for the mean at `t1` alone.
-        "ts": arrays.get("ts"),
-    }
+    return tuple(moments)
 
 
 def _check(condition: bool) -> None:
-    """Raises a `ValueError` unless the condition holds. It needs no message: `load` says
-    that the file is damaged."""
+    """Raises a `ValueError` unless the condition holds. The error needs no message, since
+    `Expectation.load` says that the file is damaged."""
     if not condition:
         raise ValueError
 
 
 def _sampling_from(header: dict[str, Any]) -> Any:
-    """The sampling, without the functions that it may have had. Raises an `OtherVersion` if
-    this version does not have it, or not all of its fields."""
+    """The sampling of an estimate (`None` if it had none), without the functions that it
+    may have had. Raises an `OtherVersion` for a sampling whose class, or one of whose
+    fields, this version does not have."""
     name = header["sampling"]
     if name is None:
         return None
     unknown = f"`{name}`"
-    sampling = SAVED_SAMPLINGS.get(name)
-    if sampling is not None:
-        own_names = {field.name for field in dataclasses.fields(sampling)}
-        unknown_names = sorted(header["fields"].keys() - own_names)
-        if not unknown_names:
-            return sampling(**header["fields"])
-        unknown += f" with {', '.join(unknown_names)}"
+    sampling_class = SAVED_SAMPLINGS.get(name)
+    if sampling_class is not None:
+        known_fields = {field.name for field in dataclasses.fields(sampling_class)}
+        unknown_fields = sorted(header["fields"].keys() - known_fields)
+        if not unknown_fields:
+            return sampling_class(**header["fields"])
+        unknown += f" with {', '.join(unknown_fields)}"
     raise OtherVersion(
         f"The estimate was sampled by {unknown}, which this version does not have. Read it "
         "with the version that wrote it."
@@ -198,9 +209,10 @@ def _sampling_from(header: dict[str, Any]) -> Any:
 
 
 def _structure_as_json(tree: Any) -> Any:
-    """The structure of a PyTree of arrays, for JSON. Each node is a dictionary from its
-    kind to its contents: `{"list": [{"array": [3]}, {"none": 0}]}` for `[x, None]` with `x`
-    of shape `(3,)`. The contents of `None` are a zero without a meaning."""
+    """The structure of a PyTree of arrays, for JSON. Each node of the PyTree becomes a
+    dictionary with one entry, from the kind of the node to its contents. For example,
+    `[x, None]` with an array `x` of shape `(3,)` becomes
+    `{"list": [{"array": [3]}, {"none": 0}]}`. (The zero for `None` means nothing.)"""
     if type(tree) is dict and all(type(name) is str for name in tree):
         # Keys are sorted, as JAX sorts them when it takes the leaves.
         children = {name: _structure_as_json(tree[name]) for name in sorted(tree)}
@@ -218,9 +230,7 @@ def _structure_as_json(tree: Any) -> Any:
 
 
 def _tree_of(structure: Any) -> Any:
-    """The PyTree with this structure, from `_structure_as_json`, of arrays of these
-    shapes."""
-    # A node has a single entry.
+    """The inverse of `_structure_as_json`: a PyTree with a shape in place of each array."""
     ((kind, contents),) = structure.items()
     if kind == "dict":
         return {name: _tree_of(child) for name, child in contents.items()}
