@@ -1,5 +1,8 @@
-"""Kernels that move paths through their steps. Each is recorded and compiled once for a
-system, and reads step sizes, times, parameters and numbers of steps."""
+"""Kernels that move paths through their steps.
+
+Kernels are recorded and compiled once for a system. The step size, the time, parameters and
+numbers of steps are inputs.
+"""
 
 import dataclasses
 import functools as ft
@@ -14,30 +17,31 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from .._custom_types import RealScalarLike
-from .._stablehlo import array_in_memory, array_types, dr, entries_of, scalar
+from .._stablehlo import array_in_memory, array_types, dr, entries_of, scalar, Tensor
 from .path_functions import PathFunctions
 from .program import as_numbers, pack, Program, tensors_of, unpack
 
 
-# Kernels of systems with more numbers in their state take long to compile.
+# The most numbers in the state of a system: kernels of larger systems take long to compile.
 _MOST_NUMBERS_IN_STATE = 256
-# Kernels of more operations compile for longer than programs of JAX. The stage equations of
-# 64 rods, 20,000 operations, compile for 4.3 s, by JAX for 5.2 s; a loop of linear systems,
-# 53,000 operations, for 16 s, by JAX for 4.9 s.
+# Kernels of more operations take longer to compile than programs of JAX. Two examples: the
+# stage equations of 64 rods (20,000 operations, which Dr.Jit compiles in 4.3 s and JAX in
+# 5.2 s), and a loop of linear systems (53,000 operations, 16 s and 4.9 s).
 _MOST_OPERATIONS = 25_000
-# Dr.Jit warns of a function that is recorded more often than this.
+# Dr.Jit warns if it records a function more often than this.
 _MOST_RECORDINGS = 100
 
 
 @dataclasses.dataclass
 class Lanes:
-    """The paths of a batch. Each Dr.Jit array has one lane for each path.
+    """The paths of a batch, as Dr.Jit arrays with one lane for each path. Each field but
+    the last is a list of one array for each entry.
 
-    - `keys`: the words of the random keys.
-    - `own_args`: the entries of the arrays in `args` that each path has of its own.
-    - `y`: the entries of the states.
-    - `solver_state`: the entries of the solver states that steps change.
-    - `stopped`: whether a step of the path was not solved.
+    - `keys`: the random keys, as integers.
+    - `own_args`: the arrays in `args` that each path has of its own.
+    - `y`: the states of the equation.
+    - `solver_state`: the arrays in the solver state that differ between paths.
+    - `stopped`: the mask of the paths of which a step was not solved.
     """
 
     keys: list[Any]
@@ -48,16 +52,17 @@ class Lanes:
 
 
 class Kernels:
-    """The kernels of a system. Raises a `ValueError` if it is too large."""
+    """The kernels of a system. Raises a `ValueError` if the state of the system is too
+    large."""
 
     def __init__(self, functions: PathFunctions):
         self._functions = functions
         # Programs are lowered for shapes and dtypes of their arguments. The number of a
-        # path is two words.
-        word = jax.ShapeDtypeStruct((), "uint32")
+        # path has 64 bits, in two integers.
+        uint32 = jax.ShapeDtypeStruct((), "uint32")
         arrays = functions.arrays
         key = functions.key
-        keys = jax.eval_shape(functions.path_keys, arrays, key, word, word)
+        keys = jax.eval_shape(functions.path_keys, arrays, key, uint32, uint32)
         y = eqx.filter_eval_shape(functions.system, arrays).y0
         y_leaves = jtu.tree_leaves(y)
         num_numbers = sum(x.size for x in y_leaves)
@@ -67,7 +72,7 @@ class Kernels:
                 f'numbers; got {num_numbers}. Pass `engine="jax"`.'
             )
         self._path_keys = Program(
-            functions.path_keys, arrays=arrays, key=key, high=word, low=word
+            functions.path_keys, arrays=arrays, key=key, high=uint32, low=uint32
         )
         self._step = Program(
             functions.step,
@@ -82,28 +87,26 @@ class Kernels:
             ),
         )
 
-        # For each array of the solver state, whether each path has its own. If all paths
-        # start alike, they share the arrays that a step returns unchanged, which then need
-        # no registers.
+        # An array of the solver state is *fixed* if paths start alike and a step returns
+        # the array unchanged: then all paths share it, and it needs no registers. Otherwise
+        # it is *moving*, and each path has its own.
         def is_moving(number: int, returned: int) -> bool:
             return functions.paths_differ or returned != number
 
-        self._is_moving = jtu.tree_map(
-            is_moving,
-            self._step.numbers["solver_state"],
-            self._step.returned.solver_state,
-        )
-        # What is packed to make the keys of paths, and for the steps of all paths: arrays
-        # of the system, step size, and the solver state that steps do not change.
+        numbers = self._step.numbers["solver_state"]
+        returned_numbers = self._step.returned.solver_state
+        self._is_moving = jtu.tree_map(is_moving, numbers, returned_numbers)
         types = self._step.types
         self._types_of_moving, fixed = eqx.partition(
             types["solver_state"], self._is_moving
         )
+        # Types of the arrays that are packed: as inputs of the steps, and of the keys.
         self._types_of_shared = dict(arrays=types["arrays"], h=types["h"], fixed=fixed)
         types_of_key = self._path_keys.types["key"]
         self._types_for_keys = dict(arrays=types["arrays"], key=types_of_key)
         self._compiled_solver_state = jax.jit(self._solver_state_at_start)
-        # They are recorded once for each combination of types and layouts of arguments.
+        # Dr.Jit calls these methods only to record their operations: once for each
+        # combination of types and layouts of arguments.
         frozen = ft.partial(dr.freeze, warn_after=_MOST_RECORDINGS)
         self._make_keys = frozen(self._record_keys)
         self._take_steps = frozen(self._record_steps)
@@ -111,20 +114,20 @@ class Kernels:
     def _solver_state_at_start(
         self, arrays: list[Array], key, y: PyTree[Array], own_args: list[Array]
     ) -> PyTree[Array]:
-        """The solver state before the first step: the state of all paths; or if paths
-        differ, the states of all along a leading axis, which `y` and `own_args` have,
-        too."""
+        """The solver state before the first step. It is the same for all paths, unless
+        paths differ: then `y`, `own_args` and the solver state have a leading axis of
+        paths."""
 
-        def start_of_numbered_path(
-            low: Array, y: PyTree[Array], own_args: list[Array]
-        ) -> PyTree[Array]:
-            keys = self._functions.path_keys(arrays, key, jnp.zeros_like(low), low)
-            return self._functions.start(arrays, keys, own_args, y)
+        def start_of_path(y: PyTree[Array], own_args: list[Array]) -> PyTree[Array]:
+            def start_of_path_number(low: Array) -> PyTree[Array]:
+                keys = self._functions.path_keys(arrays, key, jnp.zeros_like(low), low)
+                return self._functions.start(arrays, keys, own_args, y)
 
-        # No solver draws random numbers in `init`, so the number of a path does not matter.
-        # With `out_axes=None`, JAX raises an error if the result depends on it.
-        start = jax.vmap(start_of_numbered_path, (0, None, None), out_axes=None)
-        start_of_path = ft.partial(start, jnp.zeros(1, "uint32"))
+            # No solver draws random numbers in `init`, so the state does not depend on the
+            # number of the path. With `out_axes=None`, JAX raises an error if it does.
+            start = jax.vmap(start_of_path_number, out_axes=None)
+            return start(jnp.zeros(1, "uint32"))
+
         if self._functions.paths_differ:
             return jax.vmap(start_of_path)(y, own_args)
         return start_of_path(y, own_args)
@@ -140,11 +143,11 @@ class Kernels:
         own_args: PyTree[Array],
     ) -> tuple[Lanes, dict[str, Any]]:
         """The paths with the numbers `first_path` to `first_path + num_paths - 1` before
-        their first step, and what they share in steps of size `h`. If paths differ, `y0`
-        and `own_args` have a leading axis of paths."""
+        their first step, and the packed inputs that all paths share in steps of size `h`.
+        If paths differ, `y0` and `own_args` have a leading axis of paths."""
         kinds = array_types()
-        # The number of the first path is opaque: otherwise it would be a constant of the
-        # kernel, so that every batch compiled a kernel of its own, in 20 to 40 ms.
+        # The number of the first path is opaque, which means an input of the kernel. As a
+        # constant it would make every batch compile another kernel, in 20 to 40 ms.
         offset = dr.opaque(kinds["ui64"], first_path)
         path_numbers = dr.arange(kinds["ui64"], num_paths) + offset
         high = kinds["ui32"](path_numbers >> 32)
@@ -169,7 +172,7 @@ class Kernels:
         self, lanes: Lanes, shared: dict[str, Any], first_step: int, end_step: int
     ) -> Lanes:
         """The paths after the steps `first_step` to `end_step - 1`."""
-        # Numbers of steps are opaque, so that other numbers need no other kernel.
+        # The numbers are inputs of the kernel, so that it serves for all steps.
         opaque = ft.partial(dr.opaque, array_types()["i32"])
         y, solver_state, stopped = self._take_steps(
             shared, self._step.constants, opaque(first_step), opaque(end_step), lanes
@@ -187,7 +190,7 @@ class Kernels:
         leaves = zip(jtu.tree_leaves(types), jtu.tree_leaves(arrays), strict=True)
         for array_type, x in leaves:
             if self._functions.paths_differ:
-                # (entries, paths)
+                # Of shape (entries, paths).
                 rows = as_numbers(x).reshape(num_paths, -1).T
                 lanes += [array_in_memory(array_type.kind, row) for row in rows]
             else:
@@ -196,8 +199,8 @@ class Kernels:
         return lanes
 
     def _record_keys(self, packed: dict[str, Any], high: Any, low: Any) -> list[Any]:
-        """The words of the random keys of the paths with the numbers `high * 2^32 + low`,
-        as Dr.Jit records their computation."""
+        """Records the computation of the random keys, as integers, of the paths with the
+        numbers `high * 2^32 + low`."""
         arrays_and_key = unpack(self._types_for_keys, packed)
         keys, _ = self._path_keys(**arrays_and_key, high=scalar(high), low=scalar(low))
         return [*entries_of(keys)]
@@ -210,11 +213,12 @@ class Kernels:
         end_step: Any,
         lanes: Lanes,
     ) -> tuple[list[Any], list[Any], Any]:
-        """The state, the solver state and which paths stopped after the steps `first_step`
-        to `end_step - 1`, as Dr.Jit records the loop over steps. Dr.Jit asks for all that
-        is in memory as arguments, and so for the large `constants` of a step."""
+        """Records the loop over the steps `first_step` to `end_step - 1`. Returns `y`,
+        `solver_state` and `stopped` of the `Lanes` after these steps. `constants` are the
+        large constants of a step: Dr.Jit asks for all that is in memory as arguments."""
         # Dr.Jit numbers its variables one after another, one for each operation. So the
-        # difference between this number and the last one below counts the operations.
+        # operations are counted by the difference to `last_variable` below. (The count is
+        # too large if many other variables are alive: Dr.Jit fills the gaps between these.)
         first_variable = (first_step + 1).index
         types = self._step.types
         shared = unpack(self._types_of_shared, packed)
@@ -239,36 +243,38 @@ class Kernels:
                 solver_state=eqx.combine(moving, shared["fixed"]),
                 constants=constants,
             )
-            # The order decides how LLVM schedules operations: with the success first, a
-            # step of `StormerVerlet` in single precision takes 1.13 times as long, and of
-            # Heun's method 0.85.
+            # The order of these masks decides how LLVM schedules operations. With the
+            # success first, a step in single precision takes 1.13 times as long for
+            # `StormerVerlet`, and 0.85 times for Heun's method.
             for failed in (*error_masks, ~stepped.success.item()):
                 stopped = stopped | failed
 
-            # A path that stopped stays where it was: sweeps over NaN would go on to the
-            # limit in every later step.
-            def kept(old: Any, new: Any) -> Any:
-                return dr.select(stopped, old, new)
+            # A path that has stopped keeps its last state. A state of NaN would take the
+            # largest number of sweeps in every later step.
+            def kept_if_stopped(old: list[Any], new: PyTree[Tensor]) -> list[Any]:
+                new_entries = entries_of(jtu.tree_leaves(new))
+                return [dr.select(stopped, x, y) for x, y in zip(old, new_entries)]
 
-            new_y = jtu.tree_leaves(stepped.y)
+            new_y = kept_if_stopped(y, stepped.y)
             new_moving = eqx.filter(stepped.solver_state, self._is_moving)
-            new_state = entries_of(jtu.tree_leaves(new_moving))
-            kept_y = [*map(kept, y, entries_of(new_y))]
-            return i + 1, stopped, kept_y, [*map(kept, solver_state, new_state)]
+            return i + 1, stopped, new_y, kept_if_stopped(solver_state, new_moving)
 
         state_at_start = (first_step, lanes.stopped, lanes.y, lanes.solver_state)
         _, stopped, y, solver_state = dr.while_loop(
             state_at_start, has_more_steps, after_step, mode="symbolic"
         )
         last_variable = max(x.index for x in [stopped, *y, *solver_state])
-        num_operations = last_variable - first_variable
-        if num_operations > _MOST_OPERATIONS:
-            # Before the kernel is compiled.
-            warnings.warn(
-                f"A step of this system is a kernel of about {num_operations:,} "
-                "operations, which compiles for longer than JAX does, for seconds to "
-                "minutes: loops of known length, sorting and linear algebra are written "
-                'out. Pass `engine="jax"`, unless the paths are very many.',
-                stacklevel=2,
-            )
+        # The kernel is compiled after this method has returned.
+        _warn_if_slow_to_compile(num_operations=last_variable - first_variable)
         return y, solver_state, stopped
+
+
+def _warn_if_slow_to_compile(num_operations: int) -> None:
+    if num_operations > _MOST_OPERATIONS:
+        warnings.warn(
+            f"A step of this system is a kernel of about {num_operations:,} operations, "
+            "which compiles for longer than JAX does, for seconds to minutes: loops of "
+            "known length, sorting and linear algebra are written out. Pass "
+            '`engine="jax"`, unless the paths are very many.',
+            stacklevel=3,
+        )

@@ -1,4 +1,5 @@
-"""The functions of one path that kernels are made of, apart from the values they read."""
+"""The functions of one path that kernels are made of, separated from the arrays that they
+read."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,8 +20,8 @@ from .._terms import path_keys, with_keys
 class Stepped(NamedTuple):
     """A path after a step.
 
-    - `y`: its state.
-    - `solver_state`: the state of its solver.
+    - `y`: the state of the path.
+    - `solver_state`: the state of the solver.
     - `success`: whether the step succeeded.
     """
 
@@ -30,23 +31,28 @@ class Stepped(NamedTuple):
 
 
 class PathFunctions(NamedTuple):
-    """A system without the values of its arrays, as functions of these values. Hashable: it
-    is what a kernel is compiled for.
+    """The functions of one path of a system, which take the arrays of the system as an
+    argument. Hashable: for equal `PathFunctions` kernels are compiled once.
 
-    A system is a PyTree whose leaves are all that a kernel reads, with the fields `terms`,
-    `y0` and `args` and the methods `with_args`, `init` and `step` of
-    `_simulation.Problem`. For the random keys in `terms` each path substitutes its own.
+    A *system* is a PyTree whose leaves are all that a kernel reads, with the fields
+    `terms`, `y0` and `args` and the methods `with_args`, `init` and `step` of
+    `_simulation.Problem`.
 
-    In these functions `arrays` are the arrays of the system. Each path has `keys` of its
-    own, the words of the random keys in its terms; and if its `args` are drawn, `own_args`,
-    the arrays in them, of which there are none otherwise.
+    The methods have these arguments:
 
-    - `arrays`, `arrays_treedef`: the shapes and types of the arrays of the system, and its
+    - `arrays`: the arrays of the system.
+    - `keys`: the random keys of the path, which replace those in the system's `terms`.
+    - `own_args`: the arrays in the path's own `args`, if `args` are drawn for each path.
+        Otherwise it is empty.
+
+    The fields are:
+
+    - `arrays`, `arrays_treedef`: the shapes and dtypes of the arrays of the system, and its
         structure with `None` for all other leaves.
-    - `static`, `static_treedef`: the other leaves, such as the user's functions, which are
-        part of what is compiled, and the structure with `None` for arrays.
-    - `key`: the shape and type of a random key.
-    - `own_args`: the shapes of the arrays of `args` that each path has of its own.
+    - `static`, `static_treedef`: the other leaves, such as the user's functions, and the
+        structure with `None` for arrays.
+    - `key`: the shape and dtype of a random key.
+    - `own_args`: the shapes and dtypes of the argument `own_args` of the methods.
     - `paths_differ`: whether each path has its own initial state and `args`.
     - `settings`: settings of JAX that programs depend on.
     """
@@ -60,8 +66,8 @@ class PathFunctions(NamedTuple):
     paths_differ: bool
     settings: tuple[Any, ...]
 
-    # The programs of a kernel are traced from the methods below. All that they read is a
-    # field above or an argument, so that equal `PathFunctions` have equal programs.
+    # The programs of a kernel are traced from the methods below. These read nothing but
+    # fields and arguments, so that equal `PathFunctions` have equal programs.
 
     def system(self, arrays: Sequence[Any]) -> PyTree:
         """The system with these arrays."""
@@ -83,7 +89,7 @@ class PathFunctions(NamedTuple):
     ) -> PyTree[Array]:
         """The state of the solver before the first step of a path from `y`."""
         system, terms = self._system_and_terms(arrays, keys, own_args)
-        # Any size of the first step will do: no solver's initial state depends on it.
+        # No solver's initial state depends on the size of the first step.
         h = jnp.ones((), jnp.result_type(*jtu.tree_leaves(y)))
         return system.init(terms, 0, h, y)
 
@@ -104,9 +110,10 @@ class PathFunctions(NamedTuple):
     def _system_and_terms(
         self, arrays: Sequence[Any], keys: list[Array], own_args: Sequence[Any]
     ) -> tuple[PyTree, PyTree]:
-        """The system with the `args` of a path, and its terms with the keys of the path.
-        (The terms within the system keep the keys of the system.)"""
+        """The system with the `args` of a path, and the terms with the keys of the path.
+        (`system.terms` keeps the keys of the system.)"""
         system = self.system(arrays)
+        # With `None` the system keeps its own `args`.
         args_or_none = None
         if len(own_args) > 0:
             treedef = jtu.tree_structure(eqx.filter(system.args, eqx.is_array))
@@ -125,21 +132,24 @@ def functions_and_arrays(
     own_args: PyTree[Array],
     paths_differ: bool,
 ) -> tuple[PathFunctions, list[Array]]:
-    """The functions of one path, for which a kernel is compiled, and the arrays of the
-    system, which the kernel reads.
+    """Separates a system into the functions of one path, for which kernels are compiled,
+    and the arrays of the system, which the kernels read.
 
-    `own_args` is an example of the arrays in `args` that each path has of its own, and
-    `paths_differ` says whether each has its own initial state and `args`.
+    `own_args` is an example of the arrays in the `args` of each path if `args` are drawn,
+    and otherwise `None`. `paths_differ` says whether each path has its own initial state
+    and `args`.
     """
     for x in [key, *jtu.tree_leaves(system)]:
-        if isinstance(x, jax.Array) and jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
-            if not is_threefry(x):
-                raise ValueError(
-                    '`engine="drjit"` has JAX\'s default generator of random numbers, '
-                    f"threefry2x32; got a key of `{jr.key_impl(x)}`. Pass "
-                    '`jax.random.key(seed)`, or `engine="jax"`.'
-                )
-    # Arrays of NumPy are inputs, too: another parameter must not need another kernel.
+        is_array = isinstance(x, jax.Array)
+        is_key = is_array and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+        if is_key and not is_threefry(x):
+            raise ValueError(
+                '`engine="drjit"` has JAX\'s default generator of random numbers, '
+                f"threefry2x32; got a key of `{jr.key_impl(x)}`. Pass "
+                '`jax.random.key(seed)`, or `engine="jax"`.'
+            )
+    # Arrays of NumPy are inputs of the kernel as well, so that a kernel serves for all
+    # values of a parameter.
     arrays, static = eqx.partition(system, _is_array)
     array_leaves, arrays_treedef = jtu.tree_flatten(jtu.tree_map(jnp.asarray, arrays))
     static_leaves, static_treedef = jtu.tree_flatten(static)
@@ -151,7 +161,7 @@ def functions_and_arrays(
         key=_struct(key),
         own_args=tuple(map(_struct, jtu.tree_leaves(own_args))),
         paths_differ=paths_differ,
-        # The type of Python's floats says whether JAX has 64 bits.
+        # The dtype of Python's floats says whether JAX uses 64 bits.
         settings=(jax.default_backend(), jnp.result_type(float)),
     )
     return functions, array_leaves

@@ -1,4 +1,5 @@
-"""Functions of one path, lowered for replays."""
+"""Functions of one path, lowered to StableHLO; and the arrays that kernels read, packed for
+Dr.Jit."""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
@@ -24,30 +25,31 @@ from .._stablehlo import (
 
 
 class Program:
-    """A function of arrays of one path, lowered to StableHLO: a function of tensors in
-    place of these arrays.
+    """A function of arrays of one path, lowered to StableHLO. A program has a tensor in
+    place of each array, and so computes the function for many paths at once.
 
-    - `types`: for each argument of the function, by its name, the types of its arrays, in
-        the structure of the argument.
-    - `numbers`: in the same structure, the numbers of these arrays among all.
-    - `returned`: in the structure of the results, for each array the number of the array
-        that is returned unchanged in its place, or -1.
+    - `types`: the types of all argument arrays. It is a dictionary by the names of the
+        arguments, and each item has the structure of the argument.
+    - `numbers`: with the same structure, the number of each of these arrays, counted from
+        the first array of the first argument.
+    - `returned`: with the structure of the results, the number of the argument array that
+        the function returns unchanged as this result, or -1 if there is none.
     - `constants`: the large constants of the program, as arrays of Dr.Jit.
     """
 
     def __init__(self, fn: Callable, **arguments: PyTree):
         """`arguments` are PyTrees of shapes and dtypes."""
-        # On every device `fn` is lowered for CPUs: for others JAX emits calls of libraries.
-        # Unused arguments are kept, so that arguments and types are in step.
+        # `fn` is lowered for CPUs on every device: for other devices JAX emits calls of
+        # libraries. Unused arguments are kept, so that each argument array has a type.
         with jax.default_device(jax.devices("cpu")[0]):
             lowered = jax.jit(fn, keep_unused=True).lower(**arguments)
-        # The module is passed itself: to write it as text and to parse the text takes
-        # longer.
+        # The module, not its text, which would take time to write and to parse.
         self._replay = Replay(lowered.compiler_ir("stablehlo"))
         types = self._replay.arguments
         leaves, treedef = jtu.tree_flatten(arguments)
         if len(types) > len(leaves):
-            # Traced values that a function closes over are arguments of the program, too.
+            # The program has arguments that `fn` does not have: traced values that a user's
+            # function closes over.
             raise inside_jax('`engine="drjit"`')
         for leaf, array_type in zip(leaves, types):
             if array_type.kind not in array_types():
@@ -68,15 +70,16 @@ class Program:
     def __call__(
         self, *, constants: Sequence[Any] = (), **arguments: PyTree[Tensor]
     ) -> tuple[PyTree[Tensor], list[Any]]:
-        """The results, and masks of the lanes that raise an error. Without `constants`,
-        large ones are written into the kernel."""
+        """The results, and masks of the lanes that fail. `constants` are
+        `self.constants`, as arguments of the kernel. Without them, large constants are
+        written into the kernel."""
         tensors = jtu.tree_leaves(arguments)
         results, error_masks = self._replay(*tensors, constants=constants)
         return self._out_tree.unflatten(results), error_masks
 
 
 def tensors_of(types: PyTree[ArrayType], entries: Iterable[Any]) -> PyTree[Tensor]:
-    """Tensors of these types from their entries, one array after another."""
+    """Tensors of these types, each with the next of the `entries`."""
     leaves, treedef = jtu.tree_flatten(types)
     return treedef.unflatten(tensors_from(entries, [leaf.shape for leaf in leaves]))
 
@@ -84,8 +87,8 @@ def tensors_of(types: PyTree[ArrayType], entries: Iterable[Any]) -> PyTree[Tenso
 def pack(
     types: PyTree[ArrayType], arrays: PyTree[Array | np.ndarray]
 ) -> dict[str, Any]:
-    """The entries of all these arrays, which all paths share, one array after another, in
-    one array of Dr.Jit for each kind of number, such as `f64`: a kernel takes few
+    """Packs arrays that all paths share: for each kind of number, such as `f64`, one Dr.Jit
+    array of the entries of all arrays of this kind, one after another. So a kernel has few
     arguments."""
     rows: dict[str, list[np.ndarray]] = {}
     leaves = zip(jtu.tree_leaves(types), jtu.tree_leaves(arrays), strict=True)
@@ -98,8 +101,8 @@ def pack(
 
 
 def unpack(types: PyTree[ArrayType], packed: dict[str, Any]) -> PyTree[Tensor]:
-    """The inverse of `pack`, within a kernel."""
-    # For each kind, the number of entries that belong to the arrays before.
+    """The arrays that `pack` has packed, within a kernel."""
+    # For each kind, the number of entries of the arrays that are unpacked already.
     num_before = dict.fromkeys(packed, 0)
 
     def unpacked(array_type: ArrayType) -> Tensor:
@@ -107,8 +110,8 @@ def unpack(types: PyTree[ArrayType], packed: dict[str, Any]) -> PyTree[Tensor]:
         addresses = num_before[kind] + np.arange(array_type.size)
         num_before[kind] += array_type.size
         table = Table(packed[kind], addresses)
-        # Entries of small arrays are read here, before the loop over steps, and those of
-        # large ones where a step asks for them.
+        # A small array is read here, before the loop over steps. An entry of a large array
+        # is read where a step needs it.
         entries = table if array_type.size > MOST_IN_REGISTERS else [*table]
         return Tensor(entries, array_type.shape)
 
@@ -116,7 +119,7 @@ def unpack(types: PyTree[ArrayType], packed: dict[str, Any]) -> PyTree[Tensor]:
 
 
 def as_numbers(x: Array | np.ndarray) -> np.ndarray:
-    """The array in NumPy; for random keys, an array of their words."""
-    # Dr.Jit has no random keys. In a lowered program, too, random keys are their words.
+    """The array as a NumPy array. An array of random keys becomes an array of the integers
+    of the keys, which stand for the keys in lowered programs, too."""
     is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
     return np.asarray(jr.key_data(x) if is_key else x)

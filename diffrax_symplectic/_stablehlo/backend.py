@@ -1,4 +1,5 @@
-"""Imports Dr.Jit, an optional dependency, on first use; and its types of arrays."""
+"""Imports Dr.Jit, an optional dependency, on first use. Names Dr.Jit's array types by the
+types of StableHLO."""
 
 import functools as ft
 import importlib
@@ -25,7 +26,7 @@ _NO_CUDA = (
 
 @ft.cache
 def _drjit() -> Any:
-    """The module. Raises an `ImportError` that says how to install it."""
+    """The module `drjit`. Raises an `ImportError` that says how to install it."""
     try:
         return importlib.import_module("drjit")
     except ImportError as error:
@@ -33,7 +34,8 @@ def _drjit() -> Any:
 
 
 class _DrJit:
-    """Stands for the module, which is imported when something in it is first asked for."""
+    """Stands for the module `drjit`, which is imported when one of its attributes is first
+    read."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(_drjit(), name)
@@ -44,10 +46,11 @@ dr: Any = _DrJit()
 
 @ft.cache
 def array_types() -> dict[str, Any]:
-    """The types of arrays for JAX's default device, by StableHLO's names of the types of
-    their entries. Raises an `ImportError` if Dr.Jit cannot compile for it."""
+    """Dr.Jit's array types for JAX's default device, by StableHLO's names of the types of
+    numbers in them. Raises an `ImportError` if Dr.Jit cannot compile for this device."""
     on_cpu = jax.default_backend() == "cpu"
-    # Importing `drjit.llvm` succeeds without LLVM, and the first kernel then fails.
+    # Without this check `drjit.llvm` would be imported even if LLVM is missing, and the
+    # first kernel would fail.
     needed = dr.JitBackend.LLVM if on_cpu else dr.JitBackend.CUDA
     if not dr.has_backend(needed):
         raise ImportError(_NO_LLVM if on_cpu else _NO_CUDA)

@@ -1,8 +1,7 @@
-"""Complex numbers, as pairs of Dr.Jit arrays: their functions, where these are not those of
-real numbers.
+"""Elementwise operations of complex numbers, which are pairs of Dr.Jit arrays.
 
-Dr.Jit folds operations with constant zeros, so that a real number that JAX converts to a
-complex one costs as little as before.
+Dr.Jit leaves out operations with constant zeros. So a real number that JAX converts to a
+complex one, with an imaginary part of zero, costs no more than before.
 """
 
 import functools as ft
@@ -15,15 +14,15 @@ from .elementwise import elementwise, is_zero
 
 
 def _divide(a, b):
-    """`a conj(b) / |b|^2`, scaled so that no square overflows."""
+    """`a / b = a conj(b) / |b|^2`, scaled so that no square overflows."""
     if is_zero(b.imag):
-        # By a real number, as in many Hamiltonians.
+        # Many Hamiltonians divide by a real number.
         inverse = 1 / b.real
         return type(a)(a.real * inverse, a.imag * inverse)
     real_size = dr.abs(b.real)
     imag_size = dr.abs(b.imag)
     size = dr.select(real_size > imag_size, real_size, imag_size)
-    # Zero and infinity cannot be scaled.
+    # `b` is divided by its larger part, unless this part is zero or infinite.
     scale = dr.select((size > 0) & dr.isfinite(size), 1 / size, 1)
     scaled_b = type(a)(b.real * scale, b.imag * scale)
     inverse = scale / dr.squared_norm(scaled_b)
@@ -72,7 +71,7 @@ def _cosine(a):
 
 
 def equal(a, b):
-    """Whether both parts are equal."""
+    """Whether two complex numbers are equal: both parts are."""
     return (a.real == b.real) & (a.imag == b.imag)
 
 

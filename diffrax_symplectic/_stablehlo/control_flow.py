@@ -1,18 +1,24 @@
-"""Operations with regions: conditionals and loops."""
+"""Operations with regions: conditionals and loops.
 
-from collections.abc import Callable, Iterable
+If the condition is known while the kernel is recorded, only the region that it selects is
+recorded, and loops are unrolled. Otherwise the operation is a conditional or a loop of the
+kernel, in which each lane takes its own branch and makes its own number of iterations.
+"""
+
+import functools as ft
+from collections.abc import Iterable
 from typing import Any
 
 from .backend import array_types, dr
 from .mlir import block_of, call_target, operations_in
 from .operation import Operation, rule
 from .tensor import (
-    as_own_literal,
     copied_entries,
     entries_of,
     known_value,
     Tensor,
     tensors_from,
+    usable_outside,
 )
 
 
@@ -45,17 +51,17 @@ def _case(operation: Operation, index: Tensor) -> list[Tensor]:
     last = len(regions) - 1
     value = known_value(index)
     if value is not None:
-        # An index that is out of range stands for the last branch.
+        # An index that is out of range selects the last region.
         return operation.run(value if 0 <= value <= last else last, [])
-    # A kernel cannot raise an error. Lanes whose branch would raise one are marked as
-    # failed, and take the last of the other branches.
-    branches = {}
+    # A kernel cannot raise an error. Lanes whose region would raise one are marked as
+    # failed, and run the last of the other regions.
+    masks = {}
     for i, region in enumerate(regions):
         if _raises(region):
             operation.fail(index.item() == i)
         else:
-            branches[i] = index.item() == i
-    return tensors_from(_results_of_branch(operation, branches), operation.shapes)
+            masks[i] = index.item() == i
+    return tensors_from(_run_selected(operation, masks), operation.shapes)
 
 
 @rule
@@ -63,104 +69,101 @@ def _if(operation: Operation, condition: Tensor) -> list[Tensor]:
     value = known_value(condition)
     if value is not None:
         return operation.run(_IF_TRUE if value else _IF_FALSE, [])
-    # With `select` in its place both branches run: the midpoint rule, whose sweeps have
-    # such branches, took 21 ns a step in place of 13.
-    branches = {_IF_TRUE: condition.item(), _IF_FALSE: ~condition.item()}
-    return tensors_from(_results_of_branch(operation, branches), operation.shapes)
+    # This is a conditional of the kernel, since with `select` both regions would run. The
+    # sweeps of the midpoint rule have such conditionals: with `select` a step took 21 ns in
+    # place of 13.
+    masks = {_IF_TRUE: condition.item(), _IF_FALSE: ~condition.item()}
+    return tensors_from(_run_selected(operation, masks), operation.shapes)
 
 
-def _results_of_branch(
-    operation: Operation, branches: dict[int, Any]
-) -> tuple[Any, ...]:
-    """The entries that a branch returns: for each lane the first whose mask is true, or
-    the last. `branches` has their masks, by the numbers of their regions. Lanes that fail
-    in their branch are marked."""
-    (first, is_first), *others = branches.items()
+def _run_selected(operation: Operation, masks: dict[int, Any]) -> tuple[Any, ...]:
+    """Runs one of several regions in each lane, by nested conditionals of the kernel, and
+    returns the entries of its results. `masks` maps the number of each region to a mask. A
+    lane runs the first region whose mask is true, or the last region if no mask is true.
+    Lanes that fail in the region that they run are marked as failed."""
+    (region, is_selected), *others = masks.items()
 
-    def run_first() -> tuple[Any, ...]:
-        return copied_entries(operation.run(first, []))
+    def run_region() -> tuple[Any, ...]:
+        return copied_entries(operation.run(region, []))
 
     def run_one_of_others() -> tuple[Any, ...]:
-        return _results_of_branch(operation, dict(others))
-
-    def with_failures(branch: Callable[[], tuple[Any, ...]]) -> Callable:
-        def run() -> tuple[Any, ...]:
-            entries, failed = operation.with_failures(branch)
-            return *entries, failed
-
-        return run
+        return _run_selected(operation, dict(others))
 
     if not others:
-        return run_first()
-    # A symbolic conditional is a part of the kernel. Otherwise Dr.Jit may run a branch at
-    # once.
-    results = dr.if_stmt(
+        return run_region()
+    # With `mode="symbolic"` the conditional is a part of the kernel. Otherwise Dr.Jit may
+    # run a branch at once.
+    entries, failed = dr.if_stmt(
         args=(),
-        cond=is_first,
-        true_fn=with_failures(run_first),
-        false_fn=with_failures(run_one_of_others),
+        cond=is_selected,
+        true_fn=ft.partial(operation.with_failures, run_region),
+        false_fn=ft.partial(operation.with_failures, run_one_of_others),
         mode="symbolic",
     )
-    # A constant of the inside would abort the process if it were used outside, so constants
-    # are made anew.
-    *entries, failed = map(as_own_literal, results)
-    operation.fail(failed)
-    return tuple(entries)
+    operation.fail(usable_outside(failed))
+    return tuple(map(usable_outside, entries))
 
 
-# The most iterations to unroll, of a loop whose condition is known.
+# The most iterations of a loop that are unrolled, if its condition is known.
 _MOST_UNROLLED = 8
-# The same for a loop that changes indices only, such as a bisection or the exchanges of
-# rows of a matrix. Most operations of its unrolled iterations are folded.
+# The same for a loop that changes only integers and truth values, such as a bisection or
+# the exchanges of rows of a matrix. Dr.Jit folds most operations of its iterations.
 _MOST_UNROLLED_OF_INDICES = 32
 
 
 @rule
 def _while(operation: Operation, *xs: Tensor) -> list[Tensor]:
-    body = block_of(operation.mlir_op, _BODY)
-    # The last operation returns the new state.
-    *_, last = body.operations
-    is_changing = [new != old for new, old in zip(last.operands, body.arguments)]
-    changing = [k for k, is_new in enumerate(is_changing) if is_new]
+    changing = _numbers_of_changing(operation)
     changing_entries = entries_of([xs[k] for k in changing])
     has_only_indices = not any(map(dr.is_float_v, changing_entries))
     max_unrolled = _MOST_UNROLLED_OF_INDICES if has_only_indices else _MOST_UNROLLED
     state = [*xs]
-    # As long as the condition is known, the loop is unrolled. The iterations that are left
-    # then, or after too many, are a loop of the kernel.
+    # Iterations are unrolled as long as the condition is known, up to this number. The
+    # remaining ones are a loop of the kernel.
     for _ in range(max_unrolled):
         (condition,) = operation.run(_CONDITION, state)
-        goes_on = known_value(condition)
-        if goes_on is None:
+        is_met = known_value(condition)
+        if is_met is None:
             break
-        if not goes_on:
+        if not is_met:
             return state
         state = operation.run(_BODY, state)
     return _loop(operation, state, changing)
 
 
+def _numbers_of_changing(operation: Operation) -> list[int]:
+    """The state of a loop is a list of arrays, which the body maps to a new list. Returns
+    the numbers of those arrays that the body does not return unchanged."""
+    body = block_of(operation.mlir_op, _BODY)
+    *_, returns = body.operations
+    old_and_new = zip(body.arguments, returns.operands)
+    return [k for k, (old, new) in enumerate(old_and_new) if old != new]
+
+
 def _loop(
     operation: Operation, start: list[Tensor], changing: list[int]
 ) -> list[Tensor]:
-    """The state at the end of a loop of the kernel, which starts from `start`. The values
-    of the state that its body changes have the numbers `changing`."""
-    # Values that do not change stay out of the loop's state, so that constants stay known.
+    """The state at the end of a loop of the kernel that begins with the state `start`.
+    `changing` is what `_numbers_of_changing` returns."""
+    # The state of Dr.Jit's loop consists of the entries of these arrays alone, so that
+    # constants among the other arrays stay known.
     variables = [start[k] for k in changing]
 
     def whole_state(entries: Iterable[Any]) -> list[Tensor]:
+        """The state in which the changing arrays have these entries."""
         state = [*start]
         new = tensors_from(entries, [x.shape for x in variables])
         for k, x in zip(changing, new):
             state[k] = x
         return state
 
-    # The mask of the lanes that failed so far is part of the state of Dr.Jit's loop, which
-    # returns nothing else.
+    # Dr.Jit's loop returns its state and nothing else. So the mask of the lanes that have
+    # failed is a part of the state, the first one.
     def goes_on(failed: Any, *entries: Any) -> Any:
         (condition,), fails_now = operation.with_failures(
             lambda: operation.run(_CONDITION, whole_state(entries))
         )
-        # A lane that failed could go on for ever.
+        # Without the mask, the loop might never end for a lane that failed.
         return condition.item() & ~(failed | fails_now)
 
     def iterate(failed: Any, *entries: Any) -> tuple[Any, ...]:
@@ -169,7 +172,7 @@ def _loop(
         )
         return failed | fails_now, *copied_entries([state[k] for k in changing])
 
-    # Where no lane can fail, Dr.Jit leaves the mask out.
+    # If no lane can fail, the mask stays constant, and Dr.Jit leaves it out.
     no_lane = array_types()["i1"](False)
     results = dr.while_loop(
         state=(no_lane, *entries_of(variables)),
@@ -177,10 +180,10 @@ def _loop(
         body=iterate,
         mode="symbolic",
     )
-    failed, *entries = map(as_own_literal, results)
+    failed, *entries = map(usable_outside, results)
     operation.fail(failed)
     state_at_end = whole_state(entries)
-    # What fails in the last test of the condition is not in the state. The condition is run
-    # once more, to fail in these lanes; its value is not used.
+    # A lane that fails in the last evaluation of the condition leaves the loop without a
+    # mark in the state. The condition is recorded once more, only to mark these lanes.
     operation.run(_CONDITION, state_at_end)
     return state_at_end

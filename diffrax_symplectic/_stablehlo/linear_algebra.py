@@ -1,12 +1,13 @@
-"""Small dense linear algebra: what JAX calls LAPACK for on CPUs.
+"""Small dense linear algebra: operations for which JAX calls LAPACK on CPUs.
 
-Matrices are lists of rows, with an entry for all paths each. Everything is written out:
-between loops of Dr.Jit values go through memory, which costs more than operations.
+A matrix is a list of rows, whose entries are Dr.Jit arrays with a lane for each path. All
+loops are unrolled, since values that go from one loop of Dr.Jit to another go through
+memory, which costs more than operations.
 """
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeAlias
 
 from .backend import array_types, dr
@@ -23,26 +24,19 @@ Matrix: TypeAlias = list[list[Any]]
 
 
 def _lu(a: Matrix) -> tuple[Matrix, list[Any]]:
-    """The factors of `P A = L U` in one matrix, as `getrf` gives them, and for each column
-    the row that was exchanged with it, counted from one."""
+    """The factors of `P A = L U` in one matrix, as LAPACK's `getrf` returns them, and the
+    exchanges of rows that make up `P`: the `k`-th number is the number of the row, counted
+    from one, that was exchanged with row `k`."""
     rows = [[*row] for row in a]
     num_columns = len(rows[0]) if rows else 0
-    index = array_types()["i32"]
     pivots = []
     for column in range(min(len(rows), num_columns)):
         rows_below = range(column + 1, len(rows))
-        # The number of the row with the largest entry of the column, from the diagonal
-        # down. It differs between paths.
-        largest = dr.abs(rows[column][column])
-        pivot = index(column)
-        for below in rows_below:
-            size = dr.abs(rows[below][column])
-            is_larger = size > largest
-            largest = dr.select(is_larger, size, largest)
-            pivot = dr.select(is_larger, index(below), pivot)
+        pivot = _row_of_pivot(rows, column)
         pivots.append(pivot + 1)
-        # Rows in registers cannot be read by this number. So each row below is exchanged
-        # with the one on the diagonal in those lanes where it is the pivot.
+        # The row of the pivot differs between paths, and rows in registers cannot be read
+        # by a number. So each row below is exchanged with the row on the diagonal in the
+        # lanes where it is the row of the pivot.
         old_top = rows[column]
         top = old_top
         for below in rows_below:
@@ -51,8 +45,9 @@ def _lu(a: Matrix) -> tuple[Matrix, list[Any]]:
             rows[below] = _where(is_pivot, old_top, row)
             top = _where(is_pivot, row, top)
         rows[column] = top
-        # Multiples of that row make the entries below zero, and are stored in their place.
-        # If the pivot is zero, so is all that is below it.
+        # From each row below, the multiple of the row on the diagonal is subtracted that
+        # makes its entry in this column zero. The factor, an entry of L, is stored in place
+        # of the zero. If the pivot is zero, the entries below are zero already.
         inverse = dr.select(top[column] == 0, 0, 1 / top[column])
         for below in rows_below:
             row = rows[below]
@@ -62,8 +57,22 @@ def _lu(a: Matrix) -> tuple[Matrix, list[Any]]:
     return rows, pivots
 
 
+def _row_of_pivot(rows: Matrix, column: int) -> Any:
+    """The number of the row with the largest entry in this column, from the diagonal
+    down."""
+    index = array_types()["i32"]
+    largest = dr.abs(rows[column][column])
+    pivot = index(column)
+    for below in range(column + 1, len(rows)):
+        size = dr.abs(rows[below][column])
+        is_larger = size > largest
+        largest = dr.select(is_larger, size, largest)
+        pivot = dr.select(is_larger, index(below), pivot)
+    return pivot
+
+
 def _where(mask: Any, row: list[Any], other: list[Any]) -> list[Any]:
-    """One row where a mask is true, and another elsewhere."""
+    """`row` in the lanes where the mask is true, and `other` in the remaining lanes."""
     return [dr.select(mask, x, y) for x, y in zip(row, other)]
 
 
@@ -74,9 +83,10 @@ def _minus_multiple(row: list[Any], factor: Any, other: list[Any]) -> list[Any]:
 
 def _cholesky(a: Matrix) -> tuple[Matrix, Any]:
     """The lower factor of `A = L L^T`, and the mask of the lanes in which `A` is not
-    positive definite. Reads the lower triangle, and leaves the upper one.
+    positive definite. Reads the lower triangle of `A` only, and returns its upper triangle
+    above `L`.
 
-    Column by column, from the entries `a` of `A` and `l` of `L`, with sums over `k < j`:
+    The factor is computed column by column, with sums over `k < j`:
 
         l_jj = sqrt(a_jj - sum l_jk^2)
         l_ij = (a_ij - sum l_ik l_jk) / l_jj
@@ -87,7 +97,7 @@ def _cholesky(a: Matrix) -> tuple[Matrix, Any]:
         square = row[j]
         for k in range(j):
             square = dr.fma(-row[k], row[k], square)
-        # The comparison is false for NaN, too.
+        # This marks NaN as well, for which the comparison is false.
         failed = failed | ~(square > 0)
         row[j] = dr.sqrt(square)
         # One division for the whole column.
@@ -101,11 +111,11 @@ def _cholesky(a: Matrix) -> tuple[Matrix, Any]:
 
 
 def _solve_triangular(a: Matrix, b: Matrix, is_lower: bool, is_unit: bool) -> Matrix:
-    """The solution of `A X = B`. Reads one triangle of `A`, the lower or the upper one,
-    and with `is_unit` takes its diagonal for ones."""
+    """The solution of `A X = B` by substitution. Reads one triangle of `A`, the lower or
+    the upper one. With `is_unit`, ones are taken in place of the diagonal."""
     n = len(a)
     rows_of_solution: dict[int, list[Any]] = {}
-    # From the row with a single unknown on, each row has one more.
+    # The first row has a single unknown, and each further row one more.
     for i in range(n) if is_lower else reversed(range(n)):
         row = b[i]
         for j, solved_row in rows_of_solution.items():
@@ -125,35 +135,36 @@ def _entries(a: Matrix) -> list[Any]:
     return [entry for row in a for entry in row]
 
 
-# The functions below are called as LAPACK's are, without the letter for the type of
-# numbers. Their arguments are the matrices with which JAX calls these, and their results
-# the entries of each array that these return.
+# The functions below stand for LAPACK's functions of the same names (without LAPACK's
+# letter for the type of numbers). Their arguments are the matrices that JAX passes to
+# LAPACK. They return a list for each array that LAPACK returns, with the entries of the
+# array.
 
 
 def _getrf(operation: Operation, a: Matrix) -> list[list[Any]]:
     """The factors of `P A = L U`, the exchanges of rows, and `info`."""
     factors, pivots = _lu(a)
-    # LAPACK reports arguments that it does not take by a negative `info`, and pivots of
-    # zero by a positive one. JAX looks for the first only, which do not occur here.
+    # LAPACK's `info` is negative for invalid arguments, which do not occur here, and
+    # positive for pivots of zero, which JAX does not look for. So zero serves always.
     return [_entries(factors), pivots, [array_types()["i32"](0)]]
 
 
 def _potrf(operation: Operation, a: Matrix) -> list[list[Any]]:
-    """Cholesky's factor of a positive definite matrix, and `info`."""
+    """The Cholesky factor of a positive definite matrix, and `info`."""
     is_upper = operation.letter("uplo") == "U"
     # The upper factor U of `A = U^T U` is the transpose of the lower one.
     factor, failed = _cholesky(_transposed(a) if is_upper else a)
-    # JAX only compares `info` with zero, so that any other number stands for failure.
+    # JAX only compares `info` with zero: any other number means failure.
     info = dr.select(failed, array_types()["i32"](1), 0)
     return [_entries(_transposed(factor) if is_upper else factor), [info]]
 
 
 def _trsm(operation: Operation, a: Matrix, b: Matrix) -> list[list[Any]]:
-    """The solution of a triangular system, with the matrix on either side."""
+    """The solution of a triangular system `A X = B` or `X A = B`."""
     is_lower = operation.letter("uplo") == "L"
     is_on_the_right = operation.letter("side") == "R"
-    # `X A = B` is `A^T X^T = B^T`. So the matrix is transposed if it is on the right or
-    # LAPACK is asked to transpose it, but not for both.
+    # `X A = B` is `A^T X^T = B^T`. So `A` is transposed if it is on the right, or if JAX
+    # asks for the transpose. If both hold, the two transposes cancel.
     is_transposed = (operation.letter("trans_x") != "N") != is_on_the_right
     x = _solve_triangular(
         _transposed(a) if is_transposed else a,
@@ -174,33 +185,33 @@ _LAPACK: dict[str, Callable[..., list[list[Any]]]] = {
 
 @rule
 def _custom_call(operation: Operation, *xs: Tensor) -> list[Tensor]:
-    """A call of LAPACK, for which operations on entries stand in. All axes but the last two
-    are a batch of matrices."""
+    """A call of LAPACK, replaced by operations on entries. All axes of an array but the
+    last two are a batch of matrices."""
     target = call_target(operation.mlir_op)
-    # By this call, older versions of JAX say on which devices an array is.
+    # By a call of `Sharding`, older versions of JAX say on which devices an array is.
     if target == "Sharding":
         return list(xs)
-    # The first letter of LAPACK's name says the precision, single or double.
+    # The letter before the function's name says the precision, single or double.
     match = re.fullmatch("lapack_[sd](.*)_ffi", target)
     if match is None or match[1] not in _LAPACK:
         raise NotReplayed(operation.mlir_op, f"a call of `{target}`")
-    batches = []
-    for x in xs:
-        # The larger side, since right-hand sides may be many, too: `inv` has as many as
-        # unknowns.
-        if max(x.shape[-2:]) > _MOST_UNKNOWNS:
-            what = f"`{target}` with more than {_MOST_UNKNOWNS} unknowns"
-            raise NotReplayed(operation.mlir_op, what)
-        places = x.places.reshape(math.prod(x.shape[:-2]), *x.shape[-2:])
-        batches.append([[x.take(row).entries for row in matrix] for matrix in places])
-    # For each matrix of the batch, the entries of each array that LAPACK returns.
-    results = [
-        _LAPACK[match[1]](operation, *matrices)
-        for matrices in zip(*batches, strict=True)
-    ]
-    # For each array, the entries of all matrices.
+    # The number of right-hand sides is limited, too: `inv` has as many as unknowns.
+    if any(max(x.shape[-2:]) > _MOST_UNKNOWNS for x in xs):
+        what = f"`{target}` with more than {_MOST_UNKNOWNS} unknowns"
+        raise NotReplayed(operation.mlir_op, what)
+    function = _LAPACK[match[1]]
+    batches = [_matrices(x) for x in xs]
+    # For each element of the batch, the entries of each array that LAPACK returns.
+    results = [function(operation, *element) for element in zip(*batches, strict=True)]
+    # For each array, the entries of the whole batch.
     arrays = zip(*results)
     return [
         Tensor(_entries(list(entries)), shape)
         for entries, shape in zip(arrays, operation.shapes)
     ]
+
+
+def _matrices(x: Tensor) -> list[list[Sequence[Any]]]:
+    """The rows of each matrix of a batch."""
+    positions = x.positions.reshape(math.prod(x.shape[:-2]), *x.shape[-2:])
+    return [[x.take(row).entries for row in matrix] for matrix in positions]

@@ -1,9 +1,9 @@
-"""How operations of MLIR tell what they are: names, regions, constants, and the lines that
-they come from. Their attributes are read in `operation.py`.
+"""Reads functions, regions, constants and source lines from MLIR's Python objects. The
+attributes of operations are read in `operation.py`.
 
-MLIR's objects for Python promise little of this, and print some of it only. So it is used
-nowhere else, and `tests/stablehlo/test_mlir.py` tests each part by itself: if one of these
-tests fails after an upgrade of JAX, change the function here.
+MLIR promises little about these objects, and gives some values only in printed form. So
+each value is read by a function of its own, which `tests/stablehlo/test_mlir.py` tests by
+itself: if a test there fails after an upgrade of JAX, change the function here.
 """
 
 import re
@@ -13,7 +13,7 @@ import numpy as np
 
 
 def functions_of(module: Any) -> dict[str, Any]:
-    """The functions of a module of MLIR, by their names."""
+    """The functions of an MLIR module, by their names."""
     return {
         op.attributes["sym_name"].value: op
         for op in module.body.operations
@@ -22,38 +22,40 @@ def functions_of(module: Any) -> dict[str, Any]:
 
 
 def callee_of(op: Any) -> str:
-    """The name of the function that an operation of MLIR calls."""
+    """The name of the function that the operation `func.call` calls."""
     return op.attributes["callee"].value
 
 
 def call_target(op: Any) -> str:
-    """The name of what a custom call of StableHLO calls."""
+    """The name of the library function that a custom call of StableHLO calls."""
     return op.attributes["call_target_name"].value
 
 
 def block_of(op: Any, region: int = 0) -> Any:
-    """The block of a region of an operation of MLIR: regions of StableHLO have one."""
+    """The block of the operation's region with the number `region`. A region of StableHLO
+    has exactly one block."""
     return op.regions[region].blocks[0]
 
 
 def operations_in(region: Any) -> list[Any]:
-    """The operations of a region of MLIR, in their general form."""
+    """The operations of a region, as objects of MLIR's class of all operations."""
     return [op.operation for block in region.blocks for op in block.operations]
 
 
 def constant_values(op: Any) -> np.ndarray:
-    """The values of a constant of StableHLO, in its own shape."""
+    """The values of the operation `stablehlo.constant`, in the constant's shape."""
     result_type = op.results[0].type
     shape = tuple(result_type.shape)
     if str(result_type.element_type).startswith("complex"):
         return _complex_constant(str(op), shape)
-    # If all entries are equal, MLIR stores one, and may hand out this one alone.
+    # If all entries are equal, MLIR may return a single one.
     return np.broadcast_to(np.asarray(op.attributes["value"]), shape)
 
 
 def _complex_constant(text: str, shape: tuple[int, ...]) -> np.ndarray:
-    """The values of a complex constant, of which MLIR gives only the text: either
-    `dense<"0x...">` with the bytes of many, or `dense<[(1.0,2.0), ...]>`."""
+    """The values of a complex constant, which MLIR gives only as the text of the operation:
+    as `dense<"0x...">` with their bytes if they are many, and otherwise as pairs
+    `dense<[(1.0,2.0), ...]>`."""
     num_bytes = 8 if "complex<f64>" in text else 4
     if in_hexadecimal := re.search(r'dense<"0x([0-9A-F]+)">', text):
         parts = np.frombuffer(bytes.fromhex(in_hexadecimal[1]), f"<f{num_bytes}")
@@ -62,17 +64,17 @@ def _complex_constant(text: str, shape: tuple[int, ...]) -> np.ndarray:
         pairs = re.findall(r"\(([^(),]+),([^(),]+)\)", text.split(" : ")[0])
         numbers = [_number_of(part, num_bytes) for pair in pairs for part in pair]
         parts = np.array(numbers, f"<f{num_bytes}")
-    # Real and imaginary parts alternate. `real + 1j * imag` would turn an infinite part
-    # into a NaN of the other.
+    # Real and imaginary parts alternate. In `real + 1j * imag` an infinite imaginary part
+    # would make the real part NaN.
     values = parts[::2] + 0j
     values.imag = parts[1::2]
-    # A constant of equal entries is printed as one entry, which is repeated.
+    # If all entries are equal, MLIR prints a single one, which is repeated here.
     return np.resize(values, shape)
 
 
 def _number_of(text: str, num_bytes: int) -> float:
-    """The number of this size that MLIR prints as this text: as hexadecimal bits if it is
-    not finite."""
+    """The floating-point number of `num_bytes` bytes that MLIR printed as `text`. A number
+    that is not finite is printed as its bits, in hexadecimal."""
     text = text.strip()
     if not text.startswith("0x"):
         return float(text)
@@ -81,9 +83,11 @@ def _number_of(text: str, num_bytes: int) -> float:
 
 
 class SourceLine(NamedTuple):
-    """A line of a user's program.
+    """A line of Python from which an operation was traced.
 
-    - `function`, `file`, `line`: where it stands.
+    - `function`: the name of the function that the line belongs to.
+    - `file`: the path of the file.
+    - `line`: the number of the line in the file.
     """
 
     function: str
@@ -92,9 +96,10 @@ class SourceLine(NamedTuple):
 
 
 def source_lines(location: str) -> list[SourceLine]:
-    """The lines that an operation of MLIR comes from, innermost first, out of its printed
-    location, which holds each as `"fn"("file.py":12:...)`. JAX records several lines if
-    `jax_traceback_in_locations_limit` says so."""
+    """The lines of Python from which an operation was traced, innermost first. `location`
+    is the printed location of the operation, which holds each line as
+    `"fn"("file.py":12:...)`. JAX's setting `jax_traceback_in_locations_limit` says how many
+    lines JAX records."""
     lines = re.findall(r'"([^"]*)"\("([^"]+)":(\d+)', location)
     return [
         SourceLine(_name_of_function(name), file, int(line))
@@ -102,11 +107,13 @@ def source_lines(location: str) -> list[SourceLine]:
     ]
 
 
-# What Python calls parts of a function: `fn.<locals>.<genexpr>` is a line of `fn`.
+# Parts of qualified names that name no function of the user: `fn.<locals>.<genexpr>` is a
+# generator in `fn`.
 _UNNAMED = ("<locals>", "<genexpr>", "<listcomp>", "<dictcomp>", "<setcomp>")
 
 
 def _name_of_function(qualified: str) -> str:
-    """The name of the function that code of this qualified name stands in."""
+    """The name of the innermost function in a qualified name: `fn` in
+    `outer.<locals>.fn.<locals>.<genexpr>`."""
     names = [part for part in qualified.split(".") if part not in _UNNAMED]
     return names[-1] if names else qualified

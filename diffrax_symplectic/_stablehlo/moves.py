@@ -1,5 +1,5 @@
-"""Operations that make, move or convert entries, one by one: the program knows where each
-goes."""
+"""Operations that make, move or convert single entries. It is known while the kernel is
+recorded where each entry goes."""
 
 import functools as ft
 import operator
@@ -28,10 +28,10 @@ def _iota(operation: Operation) -> list[Tensor]:
 
 @rule
 def _broadcast_in_dim(operation: Operation, x: Tensor) -> list[Tensor]:
-    # The shape of `x` with an axis for each of the result: new axes have length one.
+    # `x` gets an axis for each axis of the result. The new axes have length one.
     sizes = np.ones(len(operation.shape), int)
     sizes[operation.integers("broadcast_dimensions")] = x.shape
-    return [x.take(np.broadcast_to(x.places.reshape(sizes), operation.shape))]
+    return [x.take(np.broadcast_to(x.positions.reshape(sizes), operation.shape))]
 
 
 @rule
@@ -41,7 +41,7 @@ def _reshape(operation: Operation, x: Tensor) -> list[Tensor]:
 
 @rule
 def _transpose(operation: Operation, x: Tensor) -> list[Tensor]:
-    return [x.take(x.places.transpose(operation.integers("permutation")))]
+    return [x.take(x.positions.transpose(operation.integers("permutation")))]
 
 
 @rule
@@ -49,43 +49,44 @@ def _slice(operation: Operation, x: Tensor) -> list[Tensor]:
     begins = operation.integers("start_indices")
     ends = operation.integers("limit_indices")
     kept = tuple(map(slice, begins, ends, operation.integers("strides")))
-    return [x.take(x.places[kept])]
+    return [x.take(x.positions[kept])]
 
 
 @rule
 def _reverse(operation: Operation, x: Tensor) -> list[Tensor]:
-    return [x.take(np.flip(x.places, tuple(operation.integers("dimensions"))))]
+    return [x.take(np.flip(x.positions, tuple(operation.integers("dimensions"))))]
 
 
 @rule
 def _concatenate(operation: Operation, *xs: Tensor) -> list[Tensor]:
-    whole = Tensor([*entries_of(xs)], ())
-    # Where the entries of each array begin in the list of all.
+    all_entries = Tensor(entries_of(xs), ())
+    # The position in the list of all entries at which the entries of each array begin.
     begins = np.cumsum([0, *[len(x.entries) for x in xs]])
-    places = [x.places + begin for x, begin in zip(xs, begins)]
-    return [whole.take(np.concatenate(places, operation.integer("dimension")))]
+    positions = [x.positions + begin for x, begin in zip(xs, begins)]
+    return [all_entries.take(np.concatenate(positions, operation.integer("dimension")))]
 
 
 @rule
 def _pad(operation: Operation, x: Tensor, value: Tensor) -> list[Tensor]:
     before = np.array(operation.integers("edge_padding_low"), int)
     distances = 1 + np.array(operation.integers("interior_padding"), int)
-    # One list of the entries of `x` and the value, which comes last.
+    # The value comes last in this list, and is taken wherever no entry of `x` goes.
     all_entries = Tensor([*x.entries, value.item()], ())
-    places = np.full(operation.shape, len(x.entries))
-    for index, place in np.ndenumerate(x.places):
+    positions = np.full(operation.shape, len(x.entries))
+    for index, position in np.ndenumerate(x.positions):
         target = before + np.array(index, int) * distances
         # A negative padding moves some entries out of the result.
         if np.all((target >= 0) & (target < operation.shape)):
-            places[tuple(target)] = place
-    return [all_entries.take(places)]
+            positions[tuple(target)] = position
+    return [all_entries.take(positions)]
 
 
 @rule
 def _select(
     operation: Operation, mask: Tensor, if_true: Tensor, if_false: Tensor
 ) -> list[Tensor]:
-    # `vmap` of a conditional selects between two equal tables: one stays in memory.
+    # With `vmap` of a conditional, JAX also selects between an array and itself. If the
+    # array is in memory, it stays there.
     one = if_true.entries
     other = if_false.entries
     if isinstance(one, Table) and isinstance(other, Table):
@@ -101,7 +102,7 @@ def _convert(operation: Operation, x: Tensor) -> list[Tensor]:
 
 
 def _converted(dtype: type, entry: Any) -> Any:
-    """An entry as a number of this type of Dr.Jit."""
+    """The entry, converted to this type of Dr.Jit arrays."""
     if type(entry) is dtype:
         return entry
     if dr.is_mask_v(dtype):
@@ -125,32 +126,29 @@ def _complex(operation: Operation, real: Tensor, imag: Tensor) -> list[Tensor]:
 
 @rule
 def _compare(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
-    # The directions are called as Python's functions are, such as `LT`.
+    # The name of a direction, such as `LT`, is that of a function in `operator`.
     direction = operation.word("comparison_direction").lower()
     if operation.has("compare_type") and operation.word("compare_type") == "TOTALORDER":
         a = map_entries(_in_total_order, a)
         b = map_entries(_in_total_order, b)
     if direction not in ("eq", "ne"):
         return [map_entries(getattr(operator, direction), a, b)]
-    # Complex numbers have no order, and are equal if both parts are.
-    is_equal = map_entries(
-        equal if dr.is_complex_v(a.entries[0]) else operator.eq, a, b
-    )
-    # NaN differs from everything. In Dr.Jit NaN != NaN is false, unless it is folded.
+    is_complex = dr.is_complex_v(a.entries[0])
+    is_equal = map_entries(equal if is_complex else operator.eq, a, b)
+    # `ne` is not used, since it is false for two NaNs in Dr.Jit, unless it is folded.
     return [is_equal if direction == "eq" else map_entries(operator.invert, is_equal)]
 
 
 def _in_total_order(a: Any) -> Any:
-    """An integer that orders floating-point numbers, with NaN above infinity.
-
-    The bits of positive numbers, read as an integer, are in their order, and those of
-    negative numbers in the reverse order.
-    """
+    """An integer for each floating-point number, in the total order of StableHLO, in which
+    NaN with a positive sign is above infinity."""
     num_bits = 8 * dr.itemsize_v(a)
+    # The bits of positive numbers, read as integers, have the order of the numbers, and the
+    # bits of negative numbers the reverse order.
     bits = dr.reinterpret_array(array_types()[f"i{num_bits}"], a)
-    # The shift copies the bit of the sign to all bits: of a negative number all are set, of
-    # others none. So the last line flips all bits of negative numbers but the sign, which
-    # reverses their order.
+    # The shift copies the sign to all bits, so that all bits are set for a negative number,
+    # and none otherwise. The last line then flips all bits of a negative number except the
+    # sign, which reverses the order of negative numbers.
     filled_with_sign = bits >> (num_bits - 1)
     all_but_sign = 2 ** (num_bits - 1) - 1
     return bits ^ (filled_with_sign & all_but_sign)

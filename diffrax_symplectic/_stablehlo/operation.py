@@ -1,6 +1,7 @@
-"""Operations of StableHLO, as rules see them.
+"""Operations of StableHLO, as the argument of rules; and the table of all rules.
 
-Their semantics: https://openxla.org/stablehlo/spec.
+A *rule* is a function from an operation and its operands to its results. The specification
+of operations: https://openxla.org/stablehlo/spec.
 """
 
 import functools as ft
@@ -16,18 +17,19 @@ from .backend import array_types
 from .tensor import Tensor
 
 
-# The number of the region of an operation that has a single one, such as a reduction.
+# The number of the region of an operation with a single region, such as a reduction.
 ONLY_REGION = 0
 
 
 class Operation(NamedTuple):
     """An operation of a program.
 
-    - `mlir_op`: the object of MLIR.
+    - `mlir_op`: MLIR's object for the operation.
     - `run`: `run(i, arguments)` returns the results of region number `i`, such as the body
         of a loop.
-    - `failures`: masks of the lanes that fail, for example since the program would raise an
-        error there. Rules append to them. The caller of the program sees to these lanes.
+    - `failures`: masks of lanes whose results are not valid, for example since the program
+        would raise an error in these lanes. All operations of a program append to the same
+        list by `fail`. The caller of the program computes these lanes by other means.
     """
 
     mlir_op: Any
@@ -36,7 +38,7 @@ class Operation(NamedTuple):
 
     @property
     def full_name(self) -> str:
-        """The name with the dialect, such as `stablehlo.add`, as in messages."""
+        """The name with the dialect, such as `stablehlo.add`."""
         return self.mlir_op.name
 
     @property
@@ -51,10 +53,10 @@ class Operation(NamedTuple):
 
     @property
     def dtype(self) -> Any:
-        """The type of Dr.Jit arrays for the entries of the first result. Raises a
-        `NotReplayed` if Dr.Jit has none."""
+        """The Dr.Jit type of an entry of the first result. Raises a `NotReplayed` if Dr.Jit
+        has no such type."""
         type_of_result = self.mlir_op.results[0].type
-        # A token, which orders side effects, has no type of entries.
+        # The result may be a token, which orders side effects and has no entries.
         name = str(getattr(type_of_result, "element_type", type_of_result))
         if name not in array_types():
             raise NotReplayed(self.mlir_op, f"numbers of type `{name}`")
@@ -66,17 +68,19 @@ class Operation(NamedTuple):
         return [tuple(result.type.shape) for result in self.mlir_op.results]
 
     def refusal(self, why: str) -> "NotReplayed":
-        """An error that says why an operation of this name cannot be replayed."""
+        """The error to raise if this operation cannot be replayed, with the reason after
+        the name of the operation."""
         return NotReplayed(self.mlir_op, f"`{self.full_name}` {why}")
 
-    # The methods below read an attribute of the operation, by its name in StableHLO. If
-    # one of them fails after an upgrade of JAX, print the operation.
+    # The methods below read an attribute of the operation, by its name in StableHLO. If one
+    # of them fails after an upgrade of JAX, print the operation to see what has changed.
 
     def has(self, name: str) -> bool:
+        """Whether the operation has an attribute of this name."""
         return name in self.mlir_op.attributes
 
     def integers(self, name: str) -> list[int]:
-        """A list of integers, which is empty if there is no such attribute."""
+        """A list of integers, which is empty if there is no attribute of this name."""
         return [int(i) for i in self.mlir_op.attributes[name]] if self.has(name) else []
 
     def integer(self, name: str) -> int:
@@ -90,29 +94,33 @@ class Operation(NamedTuple):
         return chr(self.mlir_op.attributes["mhlo.backend_config"][name].value)
 
     def word(self, name: str) -> str:
-        """The value of an enumeration, which MLIR only prints: of `LT` as
+        """The value of an enumeration, such as `LT`. MLIR gives it only in printed form, as
         `#stablehlo<comparison_direction LT>`."""
         return re.findall(r"\w+", str(self.mlir_op.attributes[name]))[-1]
 
     def part(self, name: str, key: str) -> list[int]:
-        """An entry of an attribute with several, which MLIR only prints: as
-        `#stablehlo.gather<offset_dims = [0], index_vector_dim = 1>`. Entries that are zero
-        or empty are not printed."""
-        # A list in brackets, or one number.
+        """The numbers of the entry `key` of an attribute with several entries. MLIR gives
+        it only in printed form, as
+        `#stablehlo.gather<offset_dims = [0], index_vector_dim = 1>`. An entry that is zero
+        or empty is not printed, and read as an empty list."""
         text = str(self.mlir_op.attributes[name])
+        # A list in brackets, or a single number.
         entry = re.search(rf"\b{key} = (\[[^\]]*\]|\d+)", text)
         return [] if entry is None else [*map(int, re.findall(r"\d+", entry[1]))]
 
     def fail(self, mask: Any) -> None:
         """Marks the lanes of this mask as failed."""
         # Often it is known while the kernel is recorded that no lane fails.
-        if not (is_literal(mask) and not mask[0]):
+        is_known_false = is_literal(mask) and not mask[0]
+        if not is_known_false:
             self.failures.append(mask)
 
     def with_failures(self, fn: Callable[[], Any]) -> tuple[Any, Any]:
-        """What `fn` returns, and the mask of the lanes that fail in it, which are taken out
-        of `failures`: a mask that is recorded within a loop or branch cannot be used
-        outside, so the loop or branch has to return it."""
+        """Calls `fn`, and returns its results and the mask of the lanes that fail in it.
+
+        The mask is not left in `failures`: if it is recorded within a loop or branch, it
+        cannot be used outside, so the loop or branch has to return it.
+        """
         num_before = len(self.failures)
         returned = fn()
         new_failures = self.failures[num_before:]
@@ -122,25 +130,28 @@ class Operation(NamedTuple):
 
 
 class NotReplayed(Exception):
-    """An operation that cannot be replayed.
+    """Raised for an operation that cannot be replayed.
 
-    - `location`: where it comes from, as JAX recorded it.
+    - `location`: the printed location of the operation, from which `source_lines` reads the
+        lines of Python.
     """
 
     def __init__(self, mlir_op: Any, what: str | None = None):
-        """`what` is the message: the part that cannot be replayed. Without it, the message
-        is the name of the operation."""
+        """`what` is the message, which says what cannot be replayed. By default it is the
+        name of the operation."""
         super().__init__(what or f"`{mlir_op.name}`")
         self.location = str(mlir_op.location)
 
 
-# From an operation and its operands to its results.
 Rule: TypeAlias = Callable[..., list[Tensor]]
+# The rules that the decorator `rule` registers, by the names of their operations.
 RULES: dict[str, Rule] = {}
 
 
 def rule(fn: Rule) -> Rule:
-    """Registers a function as the rule for the operation of the same name."""
-    # With an underscore, since Python has words such as `while` of its own.
+    """Registers a function as the rule for the operation of the same name, apart from
+    underscores at the ends."""
+    # The functions have an underscore in front since some names, such as `while`, are
+    # keywords of Python.
     RULES[fn.__name__.strip("_")] = fn
     return fn

@@ -1,4 +1,5 @@
-"""Operations of each entry, by the tables of functions in `elementwise` and `complex`."""
+"""The rule of elementwise operations: it applies a function of the tables in
+`elementwise.py` and `complex.py` to each entry."""
 
 import operator
 from collections.abc import Callable
@@ -11,9 +12,9 @@ from .operation import NotReplayed, Operation
 from .tensor import map_entries, Tensor
 
 
-# The largest angles whose sine and cosine Dr.Jit has to a unit in the last place, for each
-# size of numbers in bytes. For twice this angle they are off by 4 units in single
-# precision, and by 1e138 in double.
+# For each size of numbers in bytes, the largest angle for which Dr.Jit's sine and cosine
+# are right to a unit in the last place. For twice this angle they are off by 4 units in
+# single precision, and by 1e138 in double.
 _LARGEST_ANGLES = {4: 2.0**13, 8: 2.0**31}
 
 
@@ -21,10 +22,12 @@ def _itself(a):
     return a
 
 
-# For each function, the angle whose sine or cosine it takes, as a function of its operands.
-_ANGLES_OF_REAL: dict[str, Callable[..., Any]] = dict.fromkeys(
-    ("cosine", "sine", "tan"), _itself
-)
+# For each operation that takes a sine or cosine, the angle as a function of the operands.
+_ANGLES_OF_REAL: dict[str, Callable[..., Any]] = {
+    "cosine": _itself,
+    "sine": _itself,
+    "tan": _itself,
+}
 _ANGLES_OF_COMPLEX: dict[str, Callable[..., Any]] = {
     "cosine": operator.attrgetter("real"),
     "exponential": operator.attrgetter("imag"),
@@ -36,25 +39,21 @@ _ANGLES_OF_COMPLEX: dict[str, Callable[..., Any]] = {
 def entry_by_entry(operation: Operation, *xs: Tensor) -> list[Tensor]:
     """The rule of all operations that have no rule of their own."""
     name = operation.name
-    of_real = elementwise().get(name)
-    of_complex = complex_functions().get(name)
-    if of_real is None and of_complex is None:
+    if name not in elementwise() and name not in complex_functions():
         raise NotReplayed(operation.mlir_op)
-    # There is a first entry: `Replay` asks for no rule of arrays without entries.
-    has_complex_operand = any(dr.is_complex_v(x.entries[0]) for x in xs)
-    function = of_complex if has_complex_operand else of_real
-    angles = _ANGLES_OF_COMPLEX if has_complex_operand else _ANGLES_OF_REAL
-    if function is None:
-        raise operation.refusal(
-            f"of {'complex' if has_complex_operand else 'real'} numbers"
-        )
+    # Each operand has a first entry: `Replay` applies no rule for results without entries.
+    is_complex = any(dr.is_complex_v(x.entries[0]) for x in xs)
+    functions = complex_functions() if is_complex else elementwise()
+    angles = _ANGLES_OF_COMPLEX if is_complex else _ANGLES_OF_REAL
+    if name not in functions:
+        raise operation.refusal(f"of {'complex' if is_complex else 'real'} numbers")
 
     def applied(*entries: Any) -> Any:
         if name in angles:
-            # JAX simulates the paths of lanes that fail again.
+            # Dr.Jit's sine and cosine are wrong for larger angles: these lanes fail.
             angle = angles[name](*entries)
             largest = _LARGEST_ANGLES[dr.itemsize_v(angle)]
             operation.fail(dr.abs(angle) > largest)
-        return function(*entries)
+        return functions[name](*entries)
 
     return [map_entries(applied, *xs)]

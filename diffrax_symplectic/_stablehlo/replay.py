@@ -1,8 +1,9 @@
-"""Replays a program that JAX lowered for one path on arrays with many paths."""
+"""Replays a program that JAX lowered for one path: runs its operations on arrays that hold
+many paths."""
 
 from collections import ChainMap
 from collections.abc import Iterator, Sequence
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -22,8 +23,9 @@ from .tensor import array_in_memory, ArrayType, MOST_IN_REGISTERS, Table, Tensor
 
 _RETURNS = ("func.return", "stablehlo.return")
 
-# From a variable of the program to its tensor. Regions see the variables of the block that
-# they stand in, but not the other way round.
+# The tensor of each variable of the program. A region sees the variables of the block
+# around it, but the block does not see those of the region: so each block has a map of its
+# own.
 Values: TypeAlias = ChainMap[Any, Tensor]
 
 
@@ -38,10 +40,11 @@ class Replay:
     """
 
     def __init__(self, program: Any):
-        # The module owns the operations, so that it must be kept.
+        # Operations exist only as long as the module, so the module is kept.
         self._module = stablehlo_module(program)
         self._functions = functions_of(self._module)
-        # The constants of more entries than stay in registers, by their variables.
+        # The values of large constants, which have too many entries for registers, by their
+        # variables.
         self._constants = {
             op.results[0]: constant_values(op)
             for op in _operations_within(self._module.operation)
@@ -62,8 +65,8 @@ class Replay:
 
     @property
     def returned_arguments(self) -> list[int | None]:
-        """For each result, the number of the argument that is returned unchanged as this
-        result, or `None`."""
+        """For each result, the number of the argument that the program returns unchanged as
+        this result, or `None` if there is none."""
         arguments = [*self._main.arguments]
         *_, last = self._main.operations
         return [
@@ -78,8 +81,8 @@ class Replay:
 
     def constants(self) -> list[Any]:
         """The large constants of the program, as arrays of Dr.Jit in memory."""
-        # The caller makes them once, and passes them to each call: a frozen function of
-        # Dr.Jit takes arrays in memory as arguments only.
+        # The caller makes these arrays once, and passes them to each call: a function that
+        # Dr.Jit freezes may read arrays in memory only if they are its arguments.
         return [
             array_in_memory(_type_of(variable).kind, values.ravel())
             for variable, values in self._constants.items()
@@ -88,70 +91,89 @@ class Replay:
     def __call__(
         self, *args: Tensor, constants: Sequence[Any] = ()
     ) -> tuple[list[Tensor], list[Any]]:
-        """The results, and masks of the lanes that raise an error.
+        """The results, and masks of the lanes that fail, for example since the program
+        would raise an error there.
 
-        `constants` are what `self.constants()` returned. Without it, large constants are
+        `constants` are what `self.constants()` returned. Without them, large constants are
         written into the kernel.
         """
-        memory = dict(zip(self._constants, constants))
-        # Operations that fail append their masks.
-        failures: list[Any] = []
+        tables = {}
+        for (variable, values), memory in zip(self._constants.items(), constants):
+            table = Table(memory, np.arange(values.size), values.ravel())
+            tables[variable] = Tensor(table, values.shape)
+        run = _Run(self._functions, tables, failures=[])
+        return run.call("main", args), run.failures
 
-        def call(name: str, args: Sequence[Tensor]) -> list[Tensor]:
-            # A function of the program sees its arguments only.
-            return run_block(block_of(self._functions[name]), args, ChainMap())
 
-        # The results of a block, whose operations run one after another. `outer` holds the
-        # variables that it sees from outside.
-        def run_block(
-            block: Any, args: Sequence[Tensor], outer: Values
-        ) -> list[Tensor]:
-            values = outer.new_child(dict(zip(block.arguments, args)))
-            for view in block.operations:
-                # The general form of an operation, for which MLIR may have a class of its
-                # own.
-                op = view.operation
-                operands = [values[operand] for operand in op.operands]
-                if op.name in _RETURNS:
-                    return operands
-                values.update(zip(op.results, results_of(op, operands, values)))
-            raise AssertionError("A block ends with what it returns.")
+class _Run(NamedTuple):
+    """One run of a program.
 
-        def results_of(op: Any, operands: list[Tensor], values: Values) -> list[Tensor]:
-            if op.name == "func.call":
-                try:
-                    return call(callee_of(op), operands)
-                except NotReplayed as error:
-                    # An operation in a called function has no location in its caller.
-                    error.location += str(op.location)
-                    raise
-            # A large constant stays in memory, where the caller has put it.
-            if op.results and op.results[0] in memory:
-                constant = self._constants[op.results[0]]
-                places = np.arange(constant.size)
-                table = Table(memory[op.results[0]], places, constant.ravel())
-                return [Tensor(table, constant.shape)]
-            # Rules need not treat results without entries: there is nothing to compute. (A
-            # token, which orders side effects, has no shape.)
-            shapes = [tuple(getattr(result.type, "shape", ())) for result in op.results]
-            if shapes and all(0 in shape for shape in shapes):
-                return [Tensor([], shape) for shape in shapes]
+    - `functions`: the functions of the program, by their names.
+    - `tables`: the constants that stay in memory, by their variables.
+    - `failures`: masks of the lanes that fail, to which operations append.
+    """
 
-            def run(i: int, args: Sequence[Tensor]) -> list[Tensor]:
-                return run_block(block_of(op, i), args, values)
+    functions: dict[str, Any]
+    tables: dict[Any, Tensor]
+    failures: list[Any]
 
-            operation = Operation(op, run, failures)
-            rule = RULES.get(operation.name, entry_by_entry)
-            try:
-                return rule(operation, *operands)
-            except (TypeError, RuntimeError) as error:
-                if _names_an_operation(error):
-                    raise
-                # An error of Dr.Jit names neither the operation nor its place.
-                what = f"`{op.name}` of these types ({error})"
-                raise NotReplayed(op, what) from error
+    def call(self, name: str, args: Sequence[Tensor]) -> list[Tensor]:
+        """The results of a function of the program."""
+        # A function sees its arguments only.
+        return self.run_block(block_of(self.functions[name]), args, outer=ChainMap())
 
-        return call("main", args), failures
+    def run_block(
+        self, block: Any, args: Sequence[Tensor], outer: Values
+    ) -> list[Tensor]:
+        """The results of a block, whose operations run one after another. `outer` holds the
+        variables that the block sees from outside."""
+        values = outer.new_child(dict(zip(block.arguments, args)))
+        for view in block.operations:
+            # For some operations MLIR has classes of their own. `operation` has the class
+            # of all operations.
+            op = view.operation
+            operands = [values[operand] for operand in op.operands]
+            if op.name in _RETURNS:
+                return operands
+            values.update(zip(op.results, self.results_of(op, operands, values)))
+        raise AssertionError("A block ends with what it returns.")
+
+    def results_of(
+        self, op: Any, operands: list[Tensor], values: Values
+    ) -> list[Tensor]:
+        """The results of an operation in a block with the variables `values`."""
+        if op.name == "func.call":
+            return self.results_of_call(op, operands)
+        if op.results and op.results[0] in self.tables:
+            return [self.tables[op.results[0]]]
+        # Rules need not treat results without entries: there is nothing to compute. (A
+        # token, which orders side effects, has no shape.)
+        shapes = [tuple(getattr(result.type, "shape", ())) for result in op.results]
+        if shapes and all(0 in shape for shape in shapes):
+            return [Tensor([], shape) for shape in shapes]
+
+        def run_region(i: int, args: Sequence[Tensor]) -> list[Tensor]:
+            return self.run_block(block_of(op, i), args, outer=values)
+
+        operation = Operation(op, run_region, self.failures)
+        rule = RULES.get(operation.name, entry_by_entry)
+        try:
+            return rule(operation, *operands)
+        except (TypeError, RuntimeError) as error:
+            if _names_an_operation(error):
+                raise
+            # Errors of Dr.Jit name neither the operation nor its location.
+            what = f"`{op.name}` of these types ({error})"
+            raise NotReplayed(op, what) from error
+
+    def results_of_call(self, op: Any, operands: list[Tensor]) -> list[Tensor]:
+        """The results of an operation that calls a function of the program."""
+        try:
+            return self.call(callee_of(op), operands)
+        except NotReplayed as error:
+            # The location of an operation in the function does not say who calls it.
+            error.location += str(op.location)
+            raise
 
 
 def _type_of(variable: Any) -> ArrayType:
@@ -159,15 +181,16 @@ def _type_of(variable: Any) -> ArrayType:
 
 
 def _names_an_operation(error: BaseException | None) -> bool:
-    """Whether an error says which operation failed: it is a `NotReplayed`, or follows from
-    one in a branch or loop, for which Dr.Jit raises an error of its own."""
+    """Whether an error says which operation failed: it is a `NotReplayed`, or was raised
+    from one. (If a branch or the body of a loop raises an error, Dr.Jit raises one of its
+    own from it.)"""
     while error is not None and not isinstance(error, NotReplayed):
         error = error.__cause__ or error.__context__
     return error is not None
 
 
 def _operations_within(op: Any) -> Iterator[Any]:
-    """All operations in the regions of an operation, and in their regions."""
+    """All operations in the regions of an operation, at any depth."""
     for region in op.regions:
         for inner in operations_in(region):
             yield inner

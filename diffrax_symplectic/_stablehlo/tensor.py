@@ -1,4 +1,8 @@
-"""Arrays of one path as lists of Dr.Jit arrays, each with one entry for all paths."""
+"""Arrays of one path, for all paths at once: each entry is a Dr.Jit array with one lane for
+each path.
+
+The *position* of an entry is its index in the list of the entries in row-major order.
+"""
 
 import dataclasses
 import itertools
@@ -12,14 +16,15 @@ from .._compat import is_literal
 from .backend import array_types, dr
 
 
-# Larger arrays that all paths share stay in memory: each entry in registers is a variable
-# of the kernel, which takes time to record and to compile.
+# An array that all paths share stays in memory if it has more entries than this. Each entry
+# in registers is a variable of the kernel, which takes time to record and to compile.
 MOST_IN_REGISTERS = 64
 
 
 @dataclasses.dataclass(frozen=True)
 class ArrayType:
-    """The shape of an array, and StableHLO's name of the type of its entries (`f64`)."""
+    """The shape of an array, and `kind`, StableHLO's name of the type of its entries, such
+    as `f64`."""
 
     shape: tuple[int, ...]
     kind: str
@@ -31,13 +36,13 @@ class ArrayType:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Table(Sequence):
-    """The entries of an array that all paths share: positions in an array of Dr.Jit in
-    memory. An entry is read where a rule asks for it; each path may ask for its own.
+    """The entries of an array that all paths share, which stay in memory. An entry is read
+    only where a rule asks for it, and each path may read a different entry.
 
-    - `memory`: the array of Dr.Jit, in its own order.
-    - `addresses`: where in `memory` the entries are.
-    - `values`: the values in `memory` if these are constants of the program, so that
-        operations with them can be folded.
+    - `memory`: the Dr.Jit array that holds the entries, perhaps among others.
+    - `addresses`: for each entry, its index in `memory`.
+    - `values`: the values in `memory` if they are constants of the program, so that Dr.Jit
+        can fold operations with them.
     """
 
     memory: Any
@@ -50,12 +55,12 @@ class Table(Sequence):
     def __getitem__(self, i: Any) -> Any:
         address = int(self.addresses[i])
         if self.values is not None:
-            # A constant of the kernel, which costs no read of memory.
+            # A constant becomes a part of the kernel, without a read of memory.
             return type(self.memory)(self.values[address].item())
         return self.gathered(array_types()["ui32"](address))
 
     def gathered(self, addresses: Any) -> Any:
-        """What is at these addresses in `memory`, one for each path."""
+        """The values in `memory` at these addresses, of which each path has one."""
         return dr.gather(type(self.memory), self.memory, addresses)
 
 
@@ -68,22 +73,23 @@ class Tensor:
     shape: tuple[int, ...]
 
     @property
-    def places(self) -> np.ndarray:
-        """The positions of the entries. Rules that move entries act on these: NumPy does
-        to the array of positions what the operation does to the array."""
+    def positions(self) -> np.ndarray:
+        """The positions of the entries, as an array of this shape. A rule that moves
+        entries lets NumPy move the positions, and then takes the entries there."""
         return np.arange(len(self.entries)).reshape(self.shape)
 
-    def take(self, places: np.ndarray) -> "Tensor":
-        """The entries at these positions."""
-        # Of a table, positions are moved, and nothing is read.
+    def take(self, positions: np.ndarray) -> "Tensor":
+        """The array of the entries at these positions."""
+        # The entries of a table stay in memory: only their addresses are taken.
         if isinstance(self.entries, Table):
-            addresses = self.entries.addresses[places.ravel()]
+            addresses = self.entries.addresses[positions.ravel()]
             table = dataclasses.replace(self.entries, addresses=addresses)
-            return Tensor(table, places.shape)
-        return Tensor([self.entries[place] for place in places.flat], places.shape)
+            return Tensor(table, positions.shape)
+        entries = [self.entries[position] for position in positions.flat]
+        return Tensor(entries, positions.shape)
 
     def item(self) -> Any:
-        """The entry of an array with a single one."""
+        """The only entry of an array that has one."""
         (entry,) = self.entries
         return entry
 
@@ -94,7 +100,7 @@ def scalar(entry: Any) -> Tensor:
 
 
 def constant(dtype: type, values: np.ndarray) -> Tensor:
-    """An array of values that are part of the program. `dtype` is a type of Dr.Jit."""
+    """An array of constants with these values. `dtype` is a type of Dr.Jit arrays."""
     return Tensor([dtype(value.item()) for value in values.flat], values.shape)
 
 
@@ -107,29 +113,29 @@ def array_in_memory(kind: str, values: np.ndarray) -> Any:
         real = array_in_memory(part, np.real(values))
         imag = array_in_memory(part, np.imag(values))
         return dtype(real, imag)
-    # A list is copied. Memory of NumPy could be freed while Dr.Jit records.
+    # Dr.Jit copies a list, but may share the memory of a NumPy array, which could be freed
+    # while the kernel is recorded.
     return dtype(values.tolist())
 
 
 def known_value(x: Tensor) -> Any | None:
-    """The value of an index or a condition, which is an array with a single entry, if that
-    is a constant, or was folded from constants by Dr.Jit; `None` if it is not known while
-    the kernel is recorded.
+    """The value of an array with a single entry, such as an index or a condition, if the
+    value is known while the kernel is recorded: it is a constant, or Dr.Jit folded it from
+    constants. Otherwise `None`.
 
-    With a known index, loops are unrolled and entries selected while recording.
+    Where a value is known, loops are unrolled and entries selected at this time.
     """
     entry = x.item()
     return entry[0] if is_literal(entry) else None
 
 
 def map_entries(fn: Callable, *xs: Tensor) -> Tensor:
-    """Applies a function entry by entry. The arrays have one shape, but for scalars, which
-    are repeated as needed."""
-    # The result has the shape of the largest array: beside a scalar, an array with a single
-    # entry counts as larger, since it has axes.
+    """Applies a function entry by entry. The arrays have the same shape, except for
+    scalars, which are repeated as needed."""
+    # The result has the shape of the largest array. An array of shape (1,) counts as larger
+    # than a scalar.
     largest = max(xs, key=lambda x: (len(x.entries), len(x.shape)))
     size = len(largest.entries)
-    # The entries of each array, repeated if it is a scalar.
     operands = [
         x.entries if len(x.entries) == size else [*x.entries] * size for x in xs
     ]
@@ -145,8 +151,8 @@ def entries_of(xs: Sequence[Tensor]) -> tuple[Any, ...]:
 def tensors_from(
     entries: Iterable[Any], shapes: Sequence[tuple[int, ...]]
 ) -> list[Tensor]:
-    """Tensors of these shapes from the first of these entries, one after another: the
-    inverse of `entries_of`."""
+    """Tensors of these shapes, each with the next of the `entries`: the inverse of
+    `entries_of`."""
     remaining = iter(entries)
     tensors = []
     for shape in shapes:
@@ -156,17 +162,24 @@ def tensors_from(
 
 
 def copied_entries(xs: Sequence[Tensor]) -> tuple[Any, ...]:
-    """The entries of these tensors as objects of their own, as a branch or the body of a
-    loop must return them: Dr.Jit writes the result of a conditional into the objects that
-    a branch returned, so a value from outside would change for all who hold it."""
+    """Copies of the entries of these tensors.
+
+    A branch or the body of a loop must return copies. Dr.Jit writes the result of a
+    conditional into the objects that a branch returned: without a copy, a variable from
+    outside of the branch that the branch returns would change everywhere.
+    """
     return tuple(type(entry)(entry) for entry in entries_of(xs))
 
 
-def as_own_literal(entry: Any) -> Any:
-    """An entry that a conditional or loop returned, for use after it. If both branches
-    return the same constant, Dr.Jit returns the constant of the second branch, which is
-    defined within it only: LLVM aborts the process if an outer branch returns that."""
+def usable_outside(entry: Any) -> Any:
+    """An entry that a conditional or loop returned, for use after the conditional or loop:
+    constants are made anew.
+
+    If both branches return the same constant, Dr.Jit returns the constant of the second
+    branch, which is defined within this branch only. LLVM aborts the process if an outer
+    branch returns that constant.
+    """
     if dr.is_complex_v(entry):
         # One part of a complex number may be a constant, and the other not.
-        return type(entry)(as_own_literal(entry.real), as_own_literal(entry.imag))
+        return type(entry)(usable_outside(entry.real), usable_outside(entry.imag))
     return type(entry)(entry[0]) if is_literal(entry) else entry
