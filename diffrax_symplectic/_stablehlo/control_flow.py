@@ -61,6 +61,8 @@ def _case(operation: Operation, index: Tensor) -> list[Tensor]:
             operation.fail(index.item() == i)
         else:
             masks[i] = index.item() == i
+    if not masks:
+        raise operation.refusal("with a call of Python in each branch")
     return tensors_from(_run_selected(operation, masks), operation.shapes)
 
 

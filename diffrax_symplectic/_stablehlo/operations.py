@@ -3,7 +3,7 @@
 
 import operator
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from .backend import dr
 from .complex import complex_functions, log_of_power
@@ -12,27 +12,46 @@ from .operation import NotReplayed, Operation
 from .tensor import map_entries, Tensor
 
 
-# For each size of numbers in bytes, the largest angle for which Dr.Jit's sine and cosine
-# are right to a unit in the last place. For twice this angle they are off by 4 units in
-# single precision, and by 1e138 in double.
+class _Limit(NamedTuple):
+    """Where Dr.Jit has right results.
+
+    - `number`: a number, as a function of the operands.
+    - `largest`: its largest absolute value, for each size of numbers in bytes.
+    """
+
+    number: Callable[..., Any]
+    largest: dict[int, float]
+
+
+# Up to these angles Dr.Jit's sine and cosine are right to a unit in the last place. For
+# twice these angles they are off by 4 units in single precision, and by 1e138 in double.
 _LARGEST_ANGLES = {4: 2.0**13, 8: 2.0**31}
+# Up to these quotients a remainder is right: every whole number is a float.
+_LARGEST_QUOTIENTS = {4: 2.0**24, 8: 2.0**53}
 
 
 def _itself(a):
     return a
 
 
-# For each operation that takes a sine or cosine, the angle as a function of the operands.
-_ANGLES_OF_REAL: dict[str, Callable[..., Any]] = {
-    "cosine": _itself,
-    "sine": _itself,
-    "tan": _itself,
+def _quotient(a, b):
+    # The remainder by zero is NaN, whatever the quotient.
+    return dr.select(b == 0, 0, a / b)
+
+
+_LIMITS_OF_REAL = {
+    "cosine": _Limit(_itself, _LARGEST_ANGLES),
+    "remainder": _Limit(_quotient, _LARGEST_QUOTIENTS),
+    "sine": _Limit(_itself, _LARGEST_ANGLES),
+    "tan": _Limit(_itself, _LARGEST_ANGLES),
 }
-_ANGLES_OF_COMPLEX: dict[str, Callable[..., Any]] = {
-    "cosine": operator.attrgetter("real"),
-    "exponential": operator.attrgetter("imag"),
-    "power": lambda base, exponent: log_of_power(base, exponent).imag,
-    "sine": operator.attrgetter("real"),
+_LIMITS_OF_COMPLEX = {
+    "cosine": _Limit(operator.attrgetter("real"), _LARGEST_ANGLES),
+    "exponential": _Limit(operator.attrgetter("imag"), _LARGEST_ANGLES),
+    "power": _Limit(
+        lambda base, exponent: log_of_power(base, exponent).imag, _LARGEST_ANGLES
+    ),
+    "sine": _Limit(operator.attrgetter("real"), _LARGEST_ANGLES),
 }
 
 
@@ -44,16 +63,17 @@ def entry_by_entry(operation: Operation, *xs: Tensor) -> list[Tensor]:
     # Each operand has a first entry: `Replay` applies no rule for results without entries.
     is_complex = any(dr.is_complex_v(x.entries[0]) for x in xs)
     functions = complex_functions() if is_complex else elementwise()
-    angles = _ANGLES_OF_COMPLEX if is_complex else _ANGLES_OF_REAL
+    limits = _LIMITS_OF_COMPLEX if is_complex else _LIMITS_OF_REAL
     if name not in functions:
         raise operation.refusal(f"of {'complex' if is_complex else 'real'} numbers")
 
     def applied(*entries: Any) -> Any:
-        if name in angles:
-            # Dr.Jit's sine and cosine are wrong for larger angles: these lanes fail.
-            angle = angles[name](*entries)
-            largest = _LARGEST_ANGLES[dr.itemsize_v(angle)]
-            operation.fail(dr.abs(angle) > largest)
+        # Remainders of integers have no limit.
+        if name in limits and not dr.is_integral_v(entries[0]):
+            number = limits[name].number(*entries)
+            largest = limits[name].largest[dr.itemsize_v(number)]
+            # Beyond it Dr.Jit's result is wrong: these lanes fail.
+            operation.fail(dr.abs(number) > largest)
         return functions[name](*entries)
 
     return [map_entries(applied, *xs)]

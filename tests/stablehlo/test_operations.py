@@ -327,6 +327,21 @@ def test_lanes_fail_whose_angles_are_too_large_for_sine_and_cosine(dtype):
         )
 
 
+@in_both_precisions
+def test_lanes_fail_whose_quotients_are_too_large_for_a_remainder(dtype):
+    largest = {np.float32: 2.0**24, np.float64: 2.0**53}[dtype]
+    quotients = np.array([1.5, 0.3 * largest, 0.9 * largest, 1.1 * largest, 1e30])
+    x = np.array([*quotients, *np.negative(quotients), np.inf, 0.0], dtype) * dtype(0.7)
+    (actual,), lost = replayed_lanes(lambda x: lax.rem(x, dtype(0.7)), x)
+    too_large = np.isinf(x) | (np.abs(x) > 0.7 * largest)
+    np.testing.assert_array_equal(lost, too_large)
+    exact = np.fmod(x[~lost], dtype(0.7))
+    np.testing.assert_array_equal(actual[~lost], exact)
+    # Without a quotient there is no limit.
+    (actual,), lost = replayed_lanes(lambda x: lax.rem(x, dtype(0)), x)
+    assert not np.any(lost) and np.all(np.isnan(actual))
+
+
 NONE = jnp.zeros(0)
 EMPTY = {
     "itself": lambda x: jnp.stack([x])[:0],

@@ -4,11 +4,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from diffrax_symplectic._stablehlo import (
     array_in_memory,
     array_types,
     dr,
+    NotReplayed,
     Replay,
     scalar,
 )
@@ -98,3 +100,13 @@ def test_errors_name_the_lanes_that_raise_them():
         (result,), lost = replayed_lanes(fn, X)
         np.testing.assert_array_equal(lost, np.arange(3) >= len(exact))
         np.testing.assert_array_equal(result[~lost], exact)
+
+
+def test_python_in_each_branch_is_refused():
+    def printed(x):
+        jax.debug.print("{}", x)
+        return x
+
+    fn = lambda x: jax.lax.cond(x > 0, printed, lambda x: 2 * printed(x), x)
+    with pytest.raises(NotReplayed, match="with a call of Python in each branch"):
+        replayed_lanes(fn, np.array([1.0, -1.0]))
