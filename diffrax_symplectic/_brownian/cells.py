@@ -45,14 +45,15 @@ class Segment(eqx.Module):
 
     @staticmethod
     def from_increment(increment: Increment, h: Float[Array, ""]) -> "Segment":
-        """The segment of length `h` with this increment."""
+        """The segment of length `h` with this increment of a path, as one vector for all
+        noises."""
         assert isinstance(increment, diffrax.AbstractBrownianIncrement)
         W, _ = jfu.ravel_pytree(increment.W)
         h = h.astype(W.dtype)
         if not isinstance(increment, diffrax.AbstractSpaceTimeLevyArea):
             return Segment(h, W)
         H, _ = jfu.ravel_pytree(increment.H)
-        # This is the definition of `H`, solved for the integral.
+        # `H` is defined as `integral / h - W / 2`.
         return Segment(h, W, integral=h * (W / 2 + H))
 
     @property
@@ -66,8 +67,8 @@ class Segment(eqx.Module):
         """This segment followed by another, by Chen's rule."""
         integral = A = None
         if self.integral is not None and other.integral is not None:
-            # The other segment starts where this one ends. So relative to the start of this
-            # one, the path over the other segment is higher by `self.W`.
+            # The other segment starts where this one ends. So the path over the other
+            # segment, relative to the start of this segment, is higher by `self.W`.
             integral = self.integral + other.integral + self.W * other.h
         if self.A is not None and other.A is not None:
             outer = jnp.outer(self.W, other.W)
@@ -81,9 +82,9 @@ class Segment(eqx.Module):
         h: RealScalarLike,
         use_levy: bool,
     ) -> Increment:
-        """Converts this segment to the value of a path over a step of size `h`: with
-        `use_levy` an object of type `increment_type` with the areas of the segment, and
-        otherwise `W` alone. Arrays get the structure and shapes of `shape`."""
+        """What a path returns for a step of size `h` over this segment: with `use_levy` an
+        object of type `increment_type` with `W` and the areas of the segment, otherwise `W`
+        alone. `W` and `H` get the structure and shapes of `shape`."""
         _, unravel = zeros_and_unravel(shape)
         if not use_levy:
             return unravel(self.W)
@@ -96,8 +97,9 @@ class Segment(eqx.Module):
 
 
 def positive_or_one(h: Float[Array, ""]) -> Float[Array, ""]:
-    """The length `h` of a segment as a divisor: 1 for an empty segment. In a batch, paths
-    that have reached their end take empty steps until all paths have reached it."""
+    """The length `h` of a segment as a divisor: 1 in place of 0 for an empty segment. There
+    are empty steps in a batch: a path that has reached its end takes them until all paths
+    have reached it."""
     return jnp.where(h > 0, h, 1)
 
 
@@ -122,15 +124,16 @@ def compose(
     sample: Callable[[Int[Array, ""]], Segment],
     path_name: str,
 ) -> Segment:
-    """The segment from `t0` to `t1 >= t0`, composed of its cells. `sample(i)` draws the
-    cell that starts at `i * cell`. If the segment does not consist of whole cells, this
-    raises an error when run, with the name `path_name` of the path's class."""
+    """The segment from `t0` to `t1 >= t0`, joined from its cells of length `cell`.
+    `sample(i)` draws cell number `i`, which starts at `i * cell`. If the segment does not
+    consist of whole cells, this raises an error when run, with the name `path_name` of the
+    path's class."""
     first_cell = jnp.round(t0 / cell).astype(int)
     end_cell = jnp.round(t1 / cell).astype(int)
+    # Times are sums of rounded steps, so they are only close to multiples of `cell`.
     distance_at_start = jnp.abs(first_cell * cell - t0)
     distance_at_end = jnp.abs(end_cell * cell - t1)
     distance = jnp.maximum(distance_at_start, distance_at_end)
-    # Times are sums of rounded steps, so they are only close to multiples of `cell`.
     end_cell = eqx.error_if(
         end_cell,
         (distance > _CELL_TOLERANCE * cell) | (end_cell < first_cell),
@@ -138,9 +141,8 @@ def compose(
         "If they should, their times may have been rounded too much: enable 64 bits, or "
         "step with `diffrax.StepTo`.",
     )
-    struct = jax.eval_shape(sample, first_cell)
     # All fields of an empty segment are zero.
-    empty_segment = jtu.tree_map(lambda leaf: lax.full_like(leaf, 0), struct)
+    empty_segment = jtu.tree_map(jnp.zeros_like, jax.eval_shape(sample, first_cell))
 
     def extend(i: Int[Array, ""], segment: Segment) -> Segment:
         return segment.followed_by(sample(i))

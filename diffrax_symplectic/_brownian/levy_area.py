@@ -1,7 +1,7 @@
 """Lévy areas between noises, drawn from Fourier series of the Brownian path."""
 
 import dataclasses
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -33,11 +33,6 @@ class LevyAreaIncrement(diffrax.AbstractSpaceTimeLevyArea):
     W: BM
     H: BM
     A: Float[Array, "m m"]
-
-
-# A matrix product over at most this many Fourier terms is computed as a sum of outer
-# products.
-_MOST_UNROLLED = 4
 
 
 class LevyAreaBrownianPath(AbstractWrappedPath):
@@ -101,28 +96,31 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         self.cell = checked_cell(cell)
 
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
-        cell = self.cell
-        if cell is None and not use_levy:
-            # The increment alone is that of the wrapped path.
-            return self.path.evaluate(t0, t1)
-        if cell is None:
+        if self.cell is not None:
+            segment = self._composed_segment(t0, t1, self.cell)
+        elif use_levy:
             segment = self._drawn_segment(t0, t1)
         else:
-
-            def sample(i: Array) -> Segment:
-                # Through rounding a cell may end just beyond the end of the path.
-                start = jnp.clip(i * cell, self.path.t0, self.path.t1)
-                end = jnp.clip((i + 1) * cell, self.path.t0, self.path.t1)
-                return self._drawn_segment(start, end)
-
-            segment = compose(t0, t1, cell, sample, type(self).__name__)
+            # The increment alone is that of the wrapped path.
+            return self.path.evaluate(t0, t1)
         shape = increment_struct(self.path)
         return segment.as_increment(LevyAreaIncrement, shape, t1 - t0, use_levy)
 
+    def _composed_segment(self, t0: Array, t1: Array, cell: float) -> Segment:
+        """The path from `t0` to `t1`, with areas drawn for each cell."""
+
+        def sample(i: Array) -> Segment:
+            # Through rounding a cell may end just beyond the end of the path.
+            start = jnp.clip(i * cell, self.path.t0, self.path.t1)
+            end = jnp.clip((i + 1) * cell, self.path.t0, self.path.t1)
+            return self._drawn_segment(start, end)
+
+        return compose(t0, t1, cell, sample, type(self).__name__)
+
     def _drawn_segment(self, t0: Array, t1: Array) -> Segment:
-        """Draws the path and its areas from `t0` to `t1`, without dividing into cells."""
-        # The areas read each entry of `W` and `H` several times. XLA would compute it anew
-        # for each use.
+        """The path from `t0` to `t1`, with areas drawn for this segment as a whole."""
+        # The areas read each entry of `W` and `H` several times. Without `materialize`, XLA
+        # would compute it anew for each use.
         increment = materialize(lambda: self.path.evaluate(t0, t1, use_levy=True))
         place = place_of(t0, t1)
         size = self.num_own_words(use_levy=True)
@@ -135,10 +133,10 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         if not use_levy:
             return 0
         m = num_noises(increment_struct(self.path))
-        return sum(_group_sizes(m, self.num_terms))
+        return sum(_num_normals(m, self.num_terms))
 
     def own_increment(self, increment, own_words, h) -> Increment:
-        """Adds areas to the increment of the wrapped path. Areas are sampled over the step
+        """Adds areas to the increment of the wrapped path. The areas are drawn for the step
         as a whole, even if this path has cells."""
         # With `use_levy=False` an increment is `W` alone.
         if not isinstance(increment, diffrax.AbstractSpaceTimeLevyArea):
@@ -150,51 +148,72 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
     def _segment_from_words(
         self, increment: Increment, words: UInt32[Array, " normals"], h: RealScalarLike
     ) -> Segment:
-        """The segment over a step of size `h` with this increment, and with areas that are
-        computed from `words`."""
+        """The segment over a step of size `h` with this increment of the wrapped path, and
+        with areas that are computed from one random word for each normal variable."""
         assert isinstance(increment, diffrax.AbstractSpaceTimeLevyArea)
         H, _ = jfu.ravel_pytree(increment.H)
         segment = Segment.from_increment(increment, jnp.abs(h))
         normals = normal_from_words(words, H.dtype)
-        # The Brownian path is a line plus a bridge. The bridge over a step of size `h` is a
-        # bridge over unit time, scaled by `sqrt(h)`. So its areas are scaled by `h`.
+        # The Brownian path is a line plus a bridge. A bridge over time `h` is a bridge over
+        # unit time, scaled by `sqrt(h)`, as is its `H`. So its areas are scaled by `h`.
         unit_H = H / jnp.sqrt(positive_or_one(segment.h))
         bridge_area = segment.h * _bridge_area(unit_H, normals, self.num_terms)
-        # The areas between the line and the bridge depend only on `W` and `H`.
+        # The areas between the line and the bridge are `H_k W_l - W_k H_l`.
         outer = jnp.outer(H, segment.W)
         return dataclasses.replace(segment, A=outer - outer.T + bridge_area)
 
 
-def _group_sizes(m: int, num_terms: int) -> tuple[int, ...]:
-    """The sizes of the groups of independent standard normal variables from which the areas
-    of a bridge of `m` noises are computed. The remainder of a Fourier series are its terms
-    beyond the first `num_terms`. The groups give, in this order:
+class _Normals(NamedTuple):
+    """Standard normal variables from which the areas of a bridge are computed, by their
+    purpose; or the numbers of these variables. The remainder of a Fourier series consists
+    of its terms beyond the first `num_terms`.
 
-    - the first `num_terms` cosine coefficients of each noise;
-    - the first `num_terms` sine coefficients of each noise;
-    - the sum of the cosine coefficients in the remainder, for each noise;
-    - the area that comes from the means of the cosine coefficients in the remainder, for
-        each noise;
-    - the area that comes from the deviations of the cosine coefficients in the remainder
+    - `cosines`, `sines`: for the first `num_terms` coefficients of each noise.
+    - `remainder_sums`: for the sum of the cosine coefficients in the remainder, for each
+        noise.
+    - `mean_parts`: for the area that comes from the means of the cosine coefficients in the
+        remainder, for each noise.
+    - `deviation_parts`: for the area that comes from the deviations of these coefficients
         from their means, for each pair of noises.
     """
-    return m * num_terms, m * num_terms, m, m, m * (m - 1) // 2
+
+    cosines: Any
+    sines: Any
+    remainder_sums: Any
+    mean_parts: Any
+    deviation_parts: Any
+
+
+def _num_normals(m: int, num_terms: int) -> _Normals:
+    """The number of normal variables of each kind for `m` noises."""
+    return _Normals(
+        cosines=m * num_terms,
+        sines=m * num_terms,
+        remainder_sums=m,
+        mean_parts=m,
+        deviation_parts=m * (m - 1) // 2,
+    )
 
 
 def _bridge_area(
     H: Float[Array, " m"], normals: Float[Array, " normals"], num_terms: int
 ) -> Float[Array, "m m"]:
     r"""The Lévy areas of a Brownian bridge over unit time whose integral is `H`, computed
-    from independent standard normal numbers, in groups as in `_group_sizes`.
+    from independent standard normal numbers, one after the other as in `_Normals`.
 
     The bridge is $\sum_r a_r (\cos 2 \pi r t - 1) + b_r \sin 2 \pi r t$ with independent
     coefficients of variance $s_r = 1 / (2 \pi^2 r^2)$. Its integral is $-\sum_r a_r$. Its
-    area is $\pi \sum_r r (a_{kr} b_{lr} - b_{kr} a_{lr})$.
+    area is $\pi \sum_r r (a_{kr} b_{lr} - b_{kr} a_{lr})$. The steps are:
+
+    1. Draw the first `num_terms` coefficients, and the sum of the other cosine
+        coefficients, as if `H` were not known.
+    2. Condition the first cosine coefficients on the integral `H`.
+    3. To the area of the first terms add two Gaussian parts in place of the area of the
+        other terms, with the variances that this area has given `H`.
     """
     m = H.size
-    ends_of_groups = np.cumsum(_group_sizes(m, num_terms))
-    groups = jnp.split(normals, ends_of_groups[:-1])
-    cosines, sines, remainder_sums, mean_parts, deviation_parts = groups
+    ends = np.cumsum(_num_normals(m, num_terms))
+    groups = _Normals(*jnp.split(normals, ends[:-1]))
     # NumPy computes the constants, so that the traced program does not.
     orders = np.arange(1, num_terms + 1)
     variances = 1 / (2 * np.pi**2 * orders**2)
@@ -203,41 +222,44 @@ def _bridge_area(
     # difference negative.
     sum_beyond = 1 / 12 - np.sum(variances)
     sum_of_squares_beyond = max(1 / 360 - np.sum(variances**2), 0)
-    deviations = jnp.asarray(np.sqrt(variances), H.dtype)
-    a = deviations * cosines.reshape(m, num_terms)
-    b = deviations * sines.reshape(m, num_terms)
-    # The integral is `H` if the sum of all cosine coefficients is -H. So the coefficients
+    standard_deviations = jnp.asarray(np.sqrt(variances), H.dtype)
+    a = standard_deviations * groups.cosines.reshape(m, num_terms)
+    b = standard_deviations * groups.sines.reshape(m, num_terms)
+    # The integral is H if the sum of all cosine coefficients is -H. So the coefficients
     # must lose the excess, which is their sum plus H. Independent Gaussian variables are
     # conditioned on their sum by taking from each a share of the excess in proportion to
-    # its variance: s_r over the sum of all variances, which is 1/12.
-    sum_of_all = jnp.sum(a, axis=1) + np.sqrt(sum_beyond) * remainder_sums
+    # its variance: s_r over the sum of all variances, which is 12 s_r.
+    excess = jnp.sum(a, axis=1) + np.sqrt(sum_beyond) * groups.remainder_sums + H
     shares = jnp.asarray(12 * variances, H.dtype)
-    excess = sum_of_all + H
     a_given_H = a - shares * excess[:, None]
     series = _weighted_product(a_given_H, b, np.pi * orders)
     # Given H, the cosine coefficients of the remainder have the means -12 s_r H and the
     # variances s_r - 12 s_r^2. The means give one part of the area of the remainder, the
     # deviations from them another part. Since (pi r)^2 s_r is 1/2, the variances of these
     # parts are sums of 144 s_r^2 / 2 (times H^2) and of s_r - 12 s_r^2.
-    mean_part = jnp.outer(H, np.sqrt(72 * sum_of_squares_beyond) * mean_parts)
-    deviation = np.sqrt(sum_beyond - 12 * sum_of_squares_beyond)
-    without_deviation = series - mean_part
-    deviation_part = deviation * _above_diagonal(deviation_parts, m)
-    # The products a_kr b_lr of the area. The products b_kr a_lr are their transpose.
-    first_products = without_deviation + deviation_part
-    return first_products - first_products.T
+    mean_part = jnp.outer(H, np.sqrt(72 * sum_of_squares_beyond) * groups.mean_parts)
+    spread = np.sqrt(sum_beyond - 12 * sum_of_squares_beyond)
+    # These are the products a_kr b_lr of the area. The products b_kr a_lr are their
+    # transpose.
+    products = series - mean_part + spread * _above_diagonal(groups.deviation_parts, m)
+    return products - products.T
 
 
 def _above_diagonal(pair_values: Float[Array, " pairs"], m: int) -> Float[Array, "m m"]:
-    """A matrix with one of the values for each pair of noises above its diagonal, row by
-    row, and zeros elsewhere."""
-    # The values are gathered by their numbers, since scattering them is slow.
+    """The strictly upper triangular matrix with these entries, row by row."""
+    # Each entry of the matrix reads the value with its number: a gather, since a scatter is
+    # slow. Entries that will be zero read the first value.
     numbers = np.zeros((m, m), int)
     numbers[np.triu_indices(m, 1)] = np.arange(pair_values.size)
     if m < 2:
-        # There is no pair. The gather still needs an entry to read.
+        # With one noise there is no pair, and no value to read.
         pair_values = jnp.append(pair_values, 0)
     return jnp.triu(pair_values[numbers], 1)
+
+
+# A matrix product over at most this many Fourier terms is computed as a sum of outer
+# products.
+_MOST_UNROLLED = 4
 
 
 def _weighted_product(
@@ -247,7 +269,8 @@ def _weighted_product(
     if len(weights) > _MOST_UNROLLED:
         a = a * jnp.asarray(weights, a.dtype)
         return dot(a, b.T)
-    # Batched products of small matrices cost more than their arithmetic.
+    # In a batch, a product of small matrices takes much longer than its arithmetic. So for
+    # few terms it is a sum of outer products.
     products = [
         float(weight) * jnp.outer(a[:, i], b[:, i]) for i, weight in enumerate(weights)
     ]

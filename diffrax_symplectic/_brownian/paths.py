@@ -77,8 +77,8 @@ class WeakIncrement(diffrax.AbstractBrownianIncrement):
 
 class AbstractPathWithLaws(AbstractStepwisePath):
     """A path that draws independent random variables in each step: for each noise, one with
-    each of its `laws`. The random words of a step come in sets. Each set is for one law, in
-    the order of `laws`, and has one word for each noise.
+    each of its `laws`. The random words of a step come in sets: one set for each law, in
+    the order of `laws`, with one word for each noise.
 
     The law of the increment, `"W"`, comes first: it can be drawn without the others.
 
@@ -119,24 +119,24 @@ class AbstractPathWithLaws(AbstractStepwisePath):
     def draw(self, t0: Array, t1: Array, use_levy: bool) -> Increment:
         if self.cell is None:
             return self._drawn_at(place_of(t0, t1), t0, t1, use_levy)
-        h = jnp.asarray(self.cell, t0.dtype)
+        cell = jnp.asarray(self.cell, t0.dtype)
 
         def sample(i: Array) -> Segment:
-            # The words are drawn for the number of the cell. The number is exact, while the
-            # times of the cell are rounded.
+            # The place of a cell is its number `i`, not `place_of` its times: the number is
+            # exact, while the times are rounded.
             place = (i.astype(jnp.int32), jnp.array(0))
-            # Given the words, only the size of a step matters, not its start. Areas are
-            # always drawn, since segments are made from increments with all variables.
-            increment = self._drawn_at(place, t0=0 * h, t1=h, use_levy=True)
-            return Segment.from_increment(increment, h)
+            # Given the words, only the size of a step matters, not its start. With
+            # `use_levy` the increment is an object, as `from_increment` needs.
+            increment = self._drawn_at(place, t0=0 * cell, t1=cell, use_levy=True)
+            return Segment.from_increment(increment, cell)
 
         segment = compose(t0, t1, self.cell, sample, type(self).__name__)
         return segment.as_increment(self.levy_area, self.shape, t1 - t0, use_levy)
 
     def _drawn_at(self, place: Place, t0: Array, t1: Array, use_levy: bool):
-        """The increment from `t0` to `t1`, from the random words for a place on the time
-        axis."""
-        # Further sets leave the first one unchanged, so `W` does not depend on `use_levy`.
+        """The increment from `t0` to `t1`, from the random words that belong to `place`."""
+        # The first sets of words are the same for any number of sets. So `W` does not
+        # depend on `use_levy`.
         num_sets = len(self._drawn_laws(use_levy))
         words = random_words(self.key, place, num_sets, set_size=num_noises(self.shape))
         return self.increment(words.reshape(-1), t0, t1, use_levy)

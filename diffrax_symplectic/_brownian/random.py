@@ -22,13 +22,13 @@ from .._batch import materialize
 from .._compat import is_threefry
 
 
-# The position of a step on the time axis: an integer number of units of time, and the
-# exponent of the power of two that is the unit. `place_of` computes it.
+# The position of a step on the time axis, from `place_of`: the number `count` of units of
+# time from time zero to the step, and the `exponent` of the unit, which is `2^exponent`.
 Place: TypeAlias = tuple[Integer[Array, ""], Integer[Array, ""]]
 
-# The pairs of words of a step are numbered. A path, and each of the two kinds of wrappers
-# that draw words, has a range of this many numbers. The three ranges fit into the 20 bits
-# that a counter has for the number of a pair.
+# The pairs of words of a step are numbered. There are three ranges of this many numbers:
+# one for a path, and one for each of the two kinds of wrappers that draw words. The ranges
+# fit into the 20 bits that a counter has for the number of a pair.
 _MOST_PAIRS = 2**18
 # The first pairs of wrappers have these numbers. The first pair of a path has the number 0.
 PLATEAU_WORDS = _MOST_PAIRS
@@ -38,8 +38,9 @@ AREA_WORDS = 2 * _MOST_PAIRS
 def random_words(
     key: PRNGKeyArray, place: Place, num_sets: int, set_size: int, first_pair: int = 0
 ) -> UInt32[Array, "num_sets set_size"]:
-    """Random words for a step at `place`, in `num_sets` sets of `set_size` words each. More
-    sets leave the first ones unchanged. Raises a `ValueError` for an array of keys.
+    """Random words for a step at `place`: `num_sets` sets, the rows of an array, of
+    `set_size` words each. The first sets are the same for any number of sets. Raises a
+    `ValueError` for an array of keys.
 
     `first_pair` is the number of the first pair of words: 0 for a path, and `PLATEAU_WORDS`
     or `AREA_WORDS` for a wrapper around a path. So the words of a path and of its wrappers
@@ -55,9 +56,9 @@ def random_words(
     if is_threefry(key) and 0 < num_words <= 2 * _MOST_PAIRS:
         words = _words_from_counters(key, place, num_words, first_pair)
         return words.reshape(num_sets, set_size)
-    # This is for other generators, and for more words than a range of numbers allows (or no
-    # words). Each set has a key of its own, so that more sets leave the first ones
-    # unchanged.
+    # JAX draws the words if the generator is not Threefry, and if there are no words or
+    # more than a range of numbers allows. Each set has a key of its own, so that the first
+    # sets are the same for any number of sets.
     count, exponent = place
     step_key = jr.fold_in(jr.fold_in(key, count), exponent)
     set_keys = [jr.fold_in(step_key, first_pair + i) for i in range(num_sets)]
@@ -69,14 +70,14 @@ def random_words(
 def _words_from_counters(
     key: PRNGKeyArray, place: Place, num_words: int, first_pair: int
 ) -> UInt32[Array, " num_words"]:
-    """Words from hashes of counters by Threefry, two from each hash. A counter consists of
-    the place and the number of the pair of words. (Folding the place into the key would
-    take three hashes for the first word.)"""
+    """Words from hashes of counters by Threefry, a pair from each hash. A counter consists
+    of the place of the step and the number of the pair. (Folding the place into the key, as
+    is usual in JAX, would take three hashes for the first word.)"""
     count, exponent = place
     num_pairs = (num_words + 1) // 2
     pair_numbers = np.arange(first_pair, first_pair + num_pairs, dtype=np.uint32)
-    # A counter consists of two words. In the second one the exponent fills the upper 12
-    # bits, and the number of the pair the 20 bits below.
+    # A counter consists of two words: the count, and a word with the exponent in its upper
+    # 12 bits and the number of the pair in the 20 bits below.
     count_word = count.astype(jnp.uint32)
     pair_word = (exponent.astype(jnp.uint32) << 20) + pair_numbers
 
@@ -85,7 +86,7 @@ def _words_from_counters(
         # If only one word is needed, the second one is not computed.
         return pair[:num_words]
 
-    # XLA would compute each of the two words in a separate kernel.
+    # Without `materialize`, XLA would compute each word of a pair in a separate kernel.
     words = jnp.stack(materialize(hash_counters), axis=1)
     return words.reshape(-1)[:num_words]
 
@@ -166,8 +167,8 @@ _COUNT_SHIFT = 0.29
 
 
 def place_of(t0: Array, t1: Array) -> Place:
-    r"""The position of a step as two integers $n$ and $e$, which do not change if times are
-    rounded:
+    r"""The position of a step as two integers, the count $n$ and the exponent $e$, which do
+    not change if times are rounded:
 
     $$ n = \Bigl\lfloor \frac{t_0 + t_1}{2 \cdot 2^e} + 0.29 \Bigr\rfloor, \qquad
     e = \lfloor \log_2(1.37\, |t_1 - t_0|) \rfloor - 1. $$
@@ -177,35 +178,36 @@ def place_of(t0: Array, t1: Array) -> Place:
     overlap: their middles are less than one unit apart, and both are longer than one unit.
     """
     units_per_time, exponent = _inverse_power_of_two(jnp.abs(t1 - t0) * _SIZE_FACTOR)
-    # Late in a long float32 solve, the middles of two steps may be rounded to the same
-    # number. So the integer part of the start, which is exact, is split off before half a
-    # step is added.
+    # In units, the middle is the start plus half a step. It is not computed as one number:
+    # late in a long float32 solve, the middles of two steps may be rounded to the same
+    # number. So the count is `whole + rest`, where `whole` is the integer part of the start
+    # and is exact.
     start = t0 * units_per_time
-    half = (t1 - t0) / 2 * units_per_time
+    half_step = (t1 - t0) / 2 * units_per_time
     whole = jnp.floor(start)
-    rest = jnp.floor(start - whole + half + _COUNT_SHIFT)
-    # The count wraps around after 2^31 units, or fewer in half precision.
+    rest = jnp.floor(start - whole + half_step + _COUNT_SHIFT)
+    # Conversion to 32-bit integers is defined only below 2^31. So the count wraps around
+    # after 2^31 units, or fewer in half precision, whose range is smaller.
     period = 2.0 ** min(31, jnp.finfo(whole.dtype).maxexp - 1)
     whole = whole - period * jnp.trunc(whole / period)
     return whole.astype(jnp.int32) + rest.astype(jnp.int32), exponent
 
 
 def _inverse_power_of_two(x: Array) -> tuple[Array, Integer[Array, ""]]:
-    """`2^-e` and the exponent `e`, where `2^e` is the power of two that is more than a
-    quarter and at most half of `x > 0`. Both are read off the bits of `x`: `jnp.frexp` and
-    `jnp.ldexp` would take as long as drawing a random word."""
+    """`2^-e` and `e = floor(log2(x)) - 1`, for `x > 0`. Both are read off the bits of `x`:
+    `jnp.frexp` and `jnp.ldexp` would take as long as drawing a random word."""
     info = jnp.finfo(x.dtype)
     bits = lax.bitcast_convert_type(x, f"int{info.bits}")
     # The bits of `x = 2^k (1 + m)` with `0 <= m < 1` are, from the highest to the lowest,
     # the sign, which is zero, the number `k + bias`, and the mantissa `m`.
     k_plus_bias = bits >> info.nmant
     bias = 2 ** (info.nexp - 1) - 1
-    # The bits of `2^-k` are those of the number `-k + bias` and a mantissa of zeros. Since
-    # `2^e` is half of `2^k`, its inverse is twice `2^-k`.
+    # The bits of `2^-k` are those of `-k + bias`, which is `2 bias - (k + bias)`, and a
+    # mantissa of zeros. Since `e = k - 1`, `2^-e` is twice `2^-k`.
     bits_of_inverse = (2 * bias - k_plus_bias) << info.nmant
     inverse = lax.bitcast_convert_type(bits_of_inverse, x.dtype) * 2
     exponent = k_plus_bias.astype(jnp.int32) - (bias + 1)
-    # Over an empty step a path has no noise, so any unit will do.
+    # The size `x` of an empty step is zero. Such a step has no noise, so any unit will do.
     return jnp.where(k_plus_bias > 0, inverse, 1), exponent
 
 
@@ -267,11 +269,11 @@ class Gaussian(AbstractLaw):
         return sample * np.asarray(np.sqrt(self.variance), dtype)
 
 
-# Let p be the distance of a probability from the nearer of 0 and 1, and q = 1/2 - p. Up to
-# its sign, the normal quantile at the probability is q F(-log(4 p (1 - p))) with a smooth
-# function F. These are the coefficients of a rational approximation of F, lowest degree
-# first. They were fitted by weighted least squares for p >= 2^-33: the largest relative
-# error is 9.7e-9. All are positive, so that no digits are lost to cancellation.
+# Let `p` be the distance of a probability from the nearer of 0 and 1, and `q = 1/2 - p`. Up
+# to its sign, the normal quantile at the probability is `q F(-log(4 p (1 - p)))` with a
+# smooth function `F`. These are the coefficients of a rational approximation of `F`, lowest
+# degree first. They were fitted by weighted least squares for `p >= 2^-33`: the largest
+# relative error is 9.7e-9. All are positive, so that no digits are lost to cancellation.
 _NUMERATOR = (
     2.506628250602876, 0.894851053435387, 0.18198359950254517, 0.025040486604300607,
     0.002275143781368971, 0.00011854314661164789, 3.8177635593160345e-07,
@@ -283,22 +285,26 @@ _DENOMINATOR = (
 
 
 def normal_from_words(words: UInt32[Array, "..."], dtype) -> Float[Array, "..."]:
-    """Standard normal samples. Each word stands for an interval of probabilities of length
-    `2^-32`. Its sample is the inverse of the normal distribution function at the middle of
-    the interval."""
+    """Standard normal samples: the inverse of the normal distribution function at the
+    probability `(word + 1/2) / 2^32`. In the notation above `_NUMERATOR` a sample is
+    `q F(-log(4 p (1 - p)))`, where here `q` has the sign of the sample."""
     half = np.asarray(0.5, dtype)
-    two_intervals = np.asarray(2.0**-31, dtype)
-    # `p` and `q` are as for `_NUMERATOR`, but here `q` has the sign of the sample. Adding a
-    # half moves from the start of the word's interval to its middle. Unsigned integers are
-    # reinterpreted as signed ones, which processors convert to floats faster.
-    signed = lax.bitcast_convert_type(words ^ np.uint32(2**31), np.int32)
-    two_q = (signed.astype(dtype) + half) * two_intervals
-    # In the tails `p` is small, so that `two_p = 1 - abs(two_q)` would not be accurate.
-    tail = lax.bitcast_convert_type(jnp.minimum(words, ~words), np.int32)
-    two_p = (tail.astype(dtype) + half) * two_intervals
+    scale = np.asarray(2.0**-31, dtype)
+    # Integers are converted to floats as signed ones, which is faster.
+    #
+    # `2 q` is twice the probability, minus 1: `(word - 2^31 + 1/2) / 2^31`. Flipping the
+    # highest bit subtracts 2^31 if the result is read as a signed integer.
+    word_minus_half_range = lax.bitcast_convert_type(words ^ np.uint32(2**31), np.int32)
+    two_q = (word_minus_half_range.astype(dtype) + half) * scale
+    # `2 p` is twice the distance of the probability from the nearer of 0 and 1. This is the
+    # number of words from this one to the nearer end, plus 1/2, over 2^31. (In the tails
+    # `1 - abs(two_q)` would not be accurate.) `~words` is `2^32 - 1 - words`.
+    words_to_end = lax.bitcast_convert_type(jnp.minimum(words, ~words), np.int32)
+    two_p = (words_to_end.astype(dtype) + half) * scale
+    # `4 p (1 - p)` is `2 p (2 - 2 p)`.
     argument = -jnp.log(two_p * (2 - two_p))
-    product = two_q * half * _polynomial(_NUMERATOR, argument)
-    return product / _polynomial(_DENOMINATOR, argument)
+    numerator = two_q * half * _polynomial(_NUMERATOR, argument)
+    return numerator / _polynomial(_DENOMINATOR, argument)
 
 
 def _polynomial(coefficients: tuple[float, ...], x: Array) -> Array:

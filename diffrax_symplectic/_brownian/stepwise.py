@@ -53,8 +53,9 @@ class AbstractStepwisePath(diffrax.AbstractBrownianPath):
             ends = (jnp.asarray(jnp.zeros_like(t0)), jnp.asarray(t0))
         else:
             ends = (jnp.asarray(t0), jnp.asarray(t1))
-        # The words are integers that are computed from the times. So JAX would silently
-        # return zero for the derivative with respect to the times.
+        # Random words are integers that are computed from the times. So without
+        # `nondifferentiable`, which raises an error, JAX would return a wrong derivative
+        # with respect to the times.
         start, end = cast(tuple[Array, Array], nondifferentiable(ends, name="t"))
         return _draw_increment(self, start, end, use_levy)
 
@@ -127,8 +128,8 @@ class AbstractWrappedPath(AbstractStepwisePath):
         return wrapped.num_words(use_levy) + self.num_own_words(use_levy)
 
     def increment(self, words, t0, t1, use_levy: bool = False) -> Increment:
-        # The words of the wrapped path come first. It does not read the own words, which
-        # come after them.
+        # The words of the wrapped path come first. It reads only these, and not the own
+        # words behind them.
         wrapped = checked_stepwise(self.path)
         increment = wrapped.increment(words, t0, t1, use_levy)
         own_words = words[wrapped.num_words(use_levy) :]
@@ -215,11 +216,11 @@ def is_random(path: diffrax.AbstractBrownianPath) -> bool:
 def increment_struct(
     path: diffrax.AbstractBrownianPath,
 ) -> PyTree[jax.ShapeDtypeStruct]:
-    """The structure, shapes and dtypes of the increments of a path."""
+    """The structure, shapes and dtypes of the increments `W` of a path."""
     if isinstance(path, UnspecifiedPath):
         return path.shape
-    # This is the dtype of times in a solve, so that JAX uses the trace made here again when
-    # the solve evaluates the path.
+    # Times of a solve have JAX's default dtype. With the same dtype here, the solve uses
+    # the trace of the path that is made here.
     time = jax.ShapeDtypeStruct((), jnp.result_type(float))
     return jax.eval_shape(lambda *ends: path.evaluate(*ends), time, time)
 
@@ -248,8 +249,9 @@ def variables_from_words(
     h: RealScalarLike,
     like: PyTree[jax.ShapeDtypeStruct | Array],
 ) -> PyTree[Array]:
-    """Random variables over a step of size `h`, one with this law for each noise. They are
-    computed from one word for each, and have the structure, shapes and dtypes of `like`."""
+    """Random variables over a step of size `h`, one for each noise. Each is `sqrt(h)` times
+    the sample of the `law` for its word. They have the structure, shapes and dtypes of
+    `like`."""
     leaves, treedef = jtu.tree_flatten(like)
     ends = np.cumsum([leaf.size for leaf in leaves])
     # `h` is negative backward in time. Diffrax itself negates the increments.
@@ -265,9 +267,9 @@ def variables_from_words(
 def checked_shape(
     shape: tuple[int, ...] | PyTree[jax.ShapeDtypeStruct], path_name: str
 ) -> PyTree[jax.ShapeDtypeStruct]:
-    """The shape of the increments of a path as a PyTree of `jax.ShapeDtypeStruct`s. A tuple
-    of integers is the shape of a single array. Raises a `ValueError` for anything else, and
-    for dtypes that are not real floating-point."""
+    """The argument `shape` of a path as a PyTree of `jax.ShapeDtypeStruct`s. A tuple of
+    integers, the shape of a single array, is converted to one. Raises a `ValueError` for
+    anything else, and for dtypes that are not real floating-point."""
     if isinstance(shape, tuple) and all(isinstance(size, int) for size in shape):
         # JAX's default dtype is fixed now, since the user may change it before a step is
         # drawn.

@@ -148,14 +148,14 @@ def most_demanding_variable(names: Collection[str]) -> RandomVariable | None:
 def path_maker(
     variables: Collection[str], *, gaussian: bool, bounded: bool
 ) -> _MakePath:
-    """A function of a shape and a key that makes a path with these random variables.
+    """A function of a shape and a key that makes a path with these random variables:
 
-    The options matter only if no variable but the increment `"W"` decides on the path:
-
-    - `gaussian`: whether increments are Gaussian, not discrete;
-    - `bounded`: whether Gaussian increments are truncated, for implicit methods.
+    - with any variable but the increment `"W"`, the path that has the most demanding one;
+    - with `"W"` alone, a discrete path, or if `gaussian` a Gaussian path, which is
+        truncated if `bounded`, as for implicit methods.
     """
-    # The path of `"W"` in `VARIABLES` is the discrete one.
+    # The path of `"W"` in `VARIABLES` is the discrete one. So it is left out if increments
+    # are to be Gaussian.
     names = set(variables) - {"W"} if gaussian else variables
     variable = most_demanding_variable(names)
     if variable is not None:

@@ -50,8 +50,7 @@ def check_space_time_area(
     path: diffrax.AbstractBrownianPath, wrapper_name: str
 ) -> None:
     """Raises a `ValueError` unless the increments of `path` have space-time Lévy area."""
-    # An object without `levy_area` is no path, and fails the test below like a path without
-    # space-time Lévy area.
+    # An object that is no path has no `levy_area`. `NoneType` in its place fails the test.
     area = getattr(path, "levy_area", type(None))
     if not issubclass(area, diffrax.AbstractSpaceTimeLevyArea):
         raise ValueError(
@@ -137,7 +136,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
             )
         if unit is not None:
             is_number = eqx.is_array_like(unit) and jnp.shape(unit) == ()
-            # The sign of a traced number is not known, and is not checked.
+            # The value of a traced number is not known, and is not checked.
             if not is_number or not (is_traced(unit) or 0 < float(unit) < math.inf):
                 raise ValueError(f"`unit` must be a positive number; got {unit!r}.")
         self.path = path
@@ -157,15 +156,16 @@ class TruncatedBrownianPath(AbstractWrappedPath):
         return 0
 
     def own_increment(self, increment, own_words, h) -> Increment:
-        """Truncates the increment of the wrapped path. There are no own words."""
+        """Truncates the increment `W` of the wrapped path to the interval from `-bound` to
+        `bound`, with `bound = sqrt(2 k |h| |ln(|h| / unit)|)`. There are no own words."""
         length = jnp.abs(h)
-        length_in_units = length
+        in_units = length
         if self.unit is not None:
-            length_in_units = length / jnp.asarray(self.unit, length.dtype)
-        checked = eqx.error_if(length_in_units, length_in_units >= 1, STEP_BEYOND_UNIT)
+            in_units = length / jnp.asarray(self.unit, length.dtype)
+        in_units = eqx.error_if(in_units, in_units >= 1, STEP_BEYOND_UNIT)
         # For an empty step, the logarithm of 1 instead of 0 keeps the bound at zero.
-        log_length_in_units = jnp.log(jnp.where(checked > 0, checked, 1))
-        bound = jnp.sqrt(2 * self.k * length * jnp.abs(log_length_in_units))
+        log_in_units = jnp.log(jnp.where(in_units > 0, in_units, 1))
+        bound = jnp.sqrt(2 * self.k * length * jnp.abs(log_in_units))
 
         def clip(w: Array) -> Array:
             return jnp.clip(w, -bound.astype(w.dtype), bound.astype(w.dtype))
@@ -176,19 +176,20 @@ class TruncatedBrownianPath(AbstractWrappedPath):
 
 
 def lost_variance(path: diffrax.AbstractBrownianPath, h: float) -> float:
-    """The share of the variance of an increment over a step of size `h` that is lost by
-    truncation. If several wrappers truncate, it is the largest of their shares."""
-    share = 0.0
-    remaining = path
-    while isinstance(remaining, AbstractWrappedPath):
-        if isinstance(remaining, TruncatedBrownianPath):
+    """The variance that an increment over a step of size `h` loses by truncation, as a
+    fraction of its variance; 0 if nothing truncates the path. If several wrappers truncate
+    it, this is the largest of their fractions."""
+    lost = 0.0
+    while isinstance(path, AbstractWrappedPath):
+        if isinstance(path, TruncatedBrownianPath):
             # The bound in standard deviations is `A_h` in the docstring of the class. It is
             # zero for steps of at least one `unit`, of which nothing is left.
-            unit = 1.0 if remaining.unit is None else float(remaining.unit)
-            bound = math.sqrt(2 * remaining.k * max(-math.log(h / unit), 0))
-            share = max(share, _variance_beyond(bound))
-        remaining = remaining.path
-    return share
+            unit = 1.0 if path.unit is None else float(path.unit)
+            bound = math.sqrt(2 * path.k * max(-math.log(h / unit), 0))
+            lost = max(lost, _variance_beyond(bound))
+        # Next comes the path inside the wrapper.
+        path = path.path
+    return lost
 
 
 def _variance_beyond(bound: float) -> float:

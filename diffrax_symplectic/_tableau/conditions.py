@@ -116,8 +116,9 @@ def strong_order_residuals(tableau: AbstractTableau) -> dict[str, float]:
 
 
 def drift_order(tableau: FlatTableau) -> int:
-    """The order without noise, up to 4. Butcher's conditions must hold for each part of the
-    state that the stages write."""
+    """The order of the method without noise, as far as Butcher's conditions up to order 4
+    show it."""
+    # The vector fields of drift stages are multiplied by the step size `h` alone.
     drift_stages = [
         i for i, stage in enumerate(tableau.stages) if stage.channels == ("h",)
     ]
@@ -138,11 +139,12 @@ def drift_order(tableau: FlatTableau) -> int:
     )
     # Row number k is for order k + 1. If one of its conditions fails, the order is k.
     for order_so_far, trees in enumerate(conditions):
-        for (vector, exact), part in itertools.product(trees, set(writes)):
-            # Stages that write momenta and stages that write positions have separate
-            # weights. The condition holds for both.
-            in_part = writes == part
-            value = flat.weights[in_part] @ vector[in_part]
+        for (vector, exact), variable in itertools.product(trees, set(writes)):
+            # Stages that write momenta `p` and stages that write positions `q` have
+            # separate weights. The condition must hold for both. (In other tableaus all
+            # stages write the whole state `y`.)
+            is_written = writes == variable
+            value = flat.weights[is_written] @ vector[is_written]
             if abs(value - exact) > _ROUNDING:
                 return order_so_far
     return len(conditions)
@@ -310,17 +312,17 @@ def _weak_conditions_separable(tableau: SeparableTableau) -> tuple[dict, dict]:
     only_W = {"W": tableau.B0["W"]}
     partitioned = dataclasses.replace(tableau.partitioned(), B0=only_W)
     first, second = _weak_conditions(partitioned)
-    # From stage to stage the noise changes by terms with these coefficients, times the
-    # powers 0, 1 and 2 of `W`. The product of such a term with another variable may have a
-    # mean other than zero. So the weights of the other variable must cancel the term.
+    # The noise is evaluated at positions `Q + h A1 g(p)`, with momenta `p` that depend on
+    # `W`. In powers of `W` the terms of order 0, 1 and 2 have the coefficients below. The
+    # product of a term with another variable may have a mean other than zero. So the
+    # weights of the other variable must cancel the term.
     B0e = tableau.B0["W"].sum(axis=1)
     vectors = {
         "A1e": tableau.A1.sum(axis=1),
         "A1(B0e)": tableau.A1 @ B0e,
         "A1((B0e)^2)": tableau.A1 @ B0e**2,
     }
-    others = _conditions_on_other_variables(tableau.beta, vectors)
-    return first, second | others
+    return first, second | _conditions_on_other_variables(tableau.beta, vectors)
 
 
 @_weak_conditions.register
@@ -350,8 +352,8 @@ def _weak_conditions_additive(tableau: AdditiveTableau) -> tuple[dict, dict]:
 
 
 def _check_only_increment_drives_noise(tableau: GeneralTableau) -> None:
-    """Raises a `ValueError` unless the increment alone drives the noise of a general
-    tableau."""
+    """Raises a `ValueError` unless `W` is the only random variable that multiplies the
+    vector fields of the noise. Other variables of the tableau may multiply brackets."""
     # All variables share the weights. So a second variable that multiplies the noise itself
     # would add to the increment, and change the moments from which the conditions follow.
     # Variables that multiply brackets are of higher order: the conditions include their
@@ -368,9 +370,9 @@ def _check_only_increment_drives_noise(tableau: GeneralTableau) -> None:
 def _conditions_on_other_variables(
     beta: Mapping[str, np.ndarray], vectors: Mapping[str, np.ndarray]
 ) -> dict:
-    """Residuals of the conditions `beta[name].vector = 0`, for each random variable other
-    than `W`, with its weights `beta[name]`, and for each of the `vectors`, which are given
-    by their formulas."""
+    """Residuals of the conditions `beta[name].vector = 0`: for the weights `beta[name]` of
+    each random variable other than `W`, and each of the `vectors`, whose keys are their
+    formulas."""
     residuals = {}
     for name, weights in beta.items():
         if name == "W":
@@ -409,8 +411,9 @@ _NEGATED_CHANNELS = {
 
 
 def is_own_inverse(tableau: FlatTableau) -> bool:
-    r"""Whether the method is reversible: the step with negated controls undoes the step. So
-    it does if stages can be paired, $i \leftrightarrow \sigma(i)$, such that
+    r"""Whether the method is reversible: the step with negated controls (step size and
+    random variables) undoes the step. So it does if stages can be paired,
+    $i \leftrightarrow \sigma(i)$, such that
 
     $$a_{ij} + a_{\sigma(i)\sigma(j)} = b_j, \qquad b_{\sigma(j)} = b_j, \qquad
       c_i + c_{\sigma(i)} = 1,$$
@@ -419,8 +422,8 @@ def is_own_inverse(tableau: FlatTableau) -> bool:
     the step is stage $\sigma(i)$ of the step back, at the same state and time.
     """
     channels = {name for stage in tableau.stages for name in stage.channels}
-    # In the step back, even random variables keep their sign. With one of them, not all
-    # controls are negated.
+    # An even random variable keeps its sign if the path is reversed. With one of them, not
+    # all controls of the step back are negated.
     if not channels <= _NEGATED_CHANNELS:
         return False
 
@@ -432,7 +435,8 @@ def is_own_inverse(tableau: FlatTableau) -> bool:
         has_same_weight = np.isclose(tableau.weights[i], tableau.weights[j])
         return other.kind == stage.kind and bool(times_fit and has_same_weight)
 
-    # Few stages have more than one possible partner, so few pairings are tried.
+    # All choices of one possible partner for each stage are tried. There are few of them,
+    # since few stages have more than one possible partner.
     numbers = range(len(tableau.stages))
     partners = [[j for j in numbers if may_be_partners(i, j)] for i in numbers]
     for sigma in itertools.product(*partners):

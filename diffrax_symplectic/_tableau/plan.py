@@ -1,5 +1,9 @@
 """The plan of a step: which stages of a tableau to solve for, which to evaluate, and in
-which order. It is made from coefficients alone, before tracing."""
+which order. It is made from coefficients alone, before tracing.
+
+A stage is one evaluation of a vector field. Its channels are the names of the controls that
+multiply the vector field: `"h"` for the step size, or random variables.
+"""
 
 import dataclasses
 import functools as ft
@@ -17,11 +21,10 @@ from .tableau import FlatTableau, Stage
 # Numbers that differ by less are taken to be equal: coefficients are exact up to a few
 # roundings of numbers of order one.
 _TOLERANCE = 1e-14
-# The smallest set of unknown stages of a block is found by trying all sets, the smallest
-# first. The search ends at a size for which there are more than this many sets. Blocks of
-# up to twelve stages are always searched exhaustively. No tableau of this package has a
-# block of more than six stages. The bound only keeps an unusual tableau from taking
-# minutes.
+# The search for the smallest set of unknown stages of a block ends at a size for which
+# there are more than this many sets. Blocks of up to twelve stages are always searched
+# exhaustively. No tableau of this package has a block of more than six stages. The bound
+# only keeps an unusual tableau from taking minutes.
 _MOST_CHOICES = 1000
 
 
@@ -79,8 +82,8 @@ def _make_plan(stages: tuple[Stage, ...], matrix: bytes, weights: bytes) -> Step
         matrix=np.frombuffer(matrix, np.float64).reshape(num_stages, num_stages),
         weights=np.frombuffer(weights, np.float64),
     )
-    # Below, every coefficient other than zero counts as a dependency. Coefficients of
-    # values that a stage does not read have no effect, and are set to zero.
+    # Below, stage `i` depends on stage `j` if entry `i, j` of the matrix is not zero. So
+    # coefficients without effect, of values that a stage does not read, are set to zero.
     matrix_of_reads = np.where(tableau.reads_from, tableau.matrix, 0.0)
     tableau = dataclasses.replace(tableau, matrix=_with_exact_zeros(matrix_of_reads))
     # Each of the three reductions may make others possible: weights may cancel when stages
@@ -90,8 +93,8 @@ def _make_plan(stages: tuple[Stage, ...], matrix: bytes, weights: bytes) -> Step
         num_before = len(tableau.stages)
         tableau = _with_equal_stages_merged(tableau)
         tableau = _with_live_stages(tableau)
-        # This comes last, since a stage with further channels is no longer equal to stages
-        # with its former channels.
+        # Channels are merged last: a stage that has got further channels is no longer equal
+        # to stages with its former channels.
         tableau = _with_channels_merged(tableau)
         if len(tableau.stages) == num_before:
             return StepPlan(tableau, _blocks(tableau))
@@ -108,7 +111,8 @@ def _equal(x: np.ndarray | float, y: np.ndarray | float) -> bool:
 
 
 def _with_live_stages(tableau: FlatTableau) -> FlatTableau:
-    """The tableau with only the live stages, on which the end of the step depends."""
+    """The tableau with only the live stages: those on which the end of the step depends,
+    directly or through other stages."""
     depends = tableau.matrix != 0
     is_live = tableau.weights != 0
     # Each round adds the stages that live ones depend on. No chain of dependencies is
@@ -119,9 +123,9 @@ def _with_live_stages(tableau: FlatTableau) -> FlatTableau:
 
 
 def _with_equal_stages_merged(tableau: FlatTableau) -> FlatTableau:
-    """The tableau with a single stage in place of stages of equal value. Two values are
-    equal if the stages have the same channels, and are evaluated at the same time and
-    state. The coefficients of the two stages are added."""
+    """The tableau with a single stage in place of stages of equal value, which are those
+    with the same channels, evaluated at the same time and state. The value of the single
+    stage is used with the sums of their coefficients."""
 
     def are_equal(i: int, j: int) -> bool:
         same_channels = tableau.stages[i].channels == tableau.stages[j].channels
@@ -141,10 +145,10 @@ def _with_equal_stages_merged(tableau: FlatTableau) -> FlatTableau:
 
 
 def _with_channels_merged(tableau: FlatTableau) -> FlatTableau:
-    """The tableau with a single stage in place of two stages of which only the sum matters.
-    Such stages have different channels, are evaluated at the same time and state, and enter
-    all stages and the end of the step with the same coefficients. The single stage has the
-    channels of both, and its value is the sum."""
+    """The tableau with a single stage in place of two stages of which only the sum of their
+    values matters: they have different channels, are evaluated at the same time and state,
+    and enter all stages and the end of the step with the same coefficients. The single
+    stage has the channels of both, and its value is the sum."""
 
     def can_be_summed(i: int, j: int) -> bool:
         return (
@@ -193,34 +197,37 @@ def _blocks(tableau: FlatTableau) -> tuple[Block, ...]:
     block comes after the blocks on which it depends."""
     num_stages = len(tableau.stages)
     depends = tableau.matrix != 0
-    # Entry `i, j` says whether a chain of dependencies leads from stage `i` to stage `j`.
-    # By Warshall's algorithm, all chains through the first stages up to `k` are known after
-    # round `k`. Each stage reaches itself, so that an explicit stage is a component, too.
+    # Entry `i, j` of `reaches` says whether a chain of dependencies leads from stage `i` to
+    # stage `j`. This is Warshall's algorithm: after round `k`, all chains are known whose
+    # stages between `i` and `j` are among the first, up to number `k`. Each stage reaches
+    # itself, so that an explicit stage is a component, too.
     reaches = depends | np.eye(num_stages, dtype=bool)
     for k in range(num_stages):
         reaches = reaches | (reaches[:, k, None] & reaches[k])
     is_mutual = reaches & reaches.T
+    # All stages of a component have the same row of `is_mutual`, which marks its stages.
     components = {tuple(np.flatnonzero(row).tolist()) for row in is_mutual}
 
-    def rank(component: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
-        # A block depends on fewer stages than any block that depends on it. Blocks that
-        # depend on equally many stages are ordered by the numbers of their own stages.
+    def num_reached(component: tuple[int, ...]) -> tuple[int, tuple[int, ...]]:
+        # A block reaches more stages than any block on which it depends. Blocks that reach
+        # equally many are ordered by the numbers of their own stages.
         return int(reaches[component[0]].sum()), component
 
-    ordered = sorted(components, key=rank)
+    ordered = sorted(components, key=num_reached)
     return tuple(_as_block(component, depends, tableau) for component in ordered)
 
 
 def _as_block(
     component: tuple[int, ...], depends: _Dependencies, tableau: FlatTableau
 ) -> Block:
-    """The block that consists of the stages in `component`, which depend on each other."""
-    numbers, rounds = _smallest_cut(component, depends)
-    unknown = _groups(numbers, tableau)
+    """The block of the stages in `component`, which depend on each other: as few unknown
+    stages as possible, and explicit stages in an order in which they can be evaluated."""
+    unknown_stages, rounds = _smallest_cut(component, depends)
+    unknown = _groups(unknown_stages, tableau)
     if len(unknown) > 1:
-        # The values of a group are stacked, and each other group would unstack them again.
-        # So each unknown stage becomes a group: an iteration of five stages takes a third
-        # less time.
+        # The values of a group are stacked, and every other group that reads them would
+        # unstack them again. So each unknown stage becomes a group of its own: an iteration
+        # of five stages takes a third less time.
         unknown = tuple((i,) for group in unknown for i in group)
     explicit = [group for ready in rounds for group in _groups(ready, tableau)]
     return Block(unknown, tuple(explicit))
@@ -241,8 +248,9 @@ def _smallest_cut(
     """The fewest stages of a block whose removal breaks all cycles of dependencies; and the
     rounds in which the other stages can then be evaluated, as from `_rounds`.
 
-    If there are too many choices, all stages of the block are removed. This leads to the
-    same solution, but more equations have to be solved than necessary.
+    All sets of stages are tried, the smallest first. If there are too many, all stages of
+    the block are removed. This leads to the same solution, but more equations have to be
+    solved than necessary.
     """
     for size in range(len(block)):
         if math.comb(len(block), size) > _MOST_CHOICES:

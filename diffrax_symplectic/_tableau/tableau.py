@@ -75,12 +75,9 @@ class FlatTableau:
         writes."""
         # It suffices to compare names: in the tableaus below, either all stages write "y",
         # or each writes "p" or "q".
-        rows = [
-            [reader.reads == writer.writes for writer in self.stages]
-            for reader in self.stages
-        ]
-        # If there are no stages, the list of rows has only one axis.
-        return np.array(rows, bool).reshape(self.matrix.shape)
+        reads = np.array([stage.reads for stage in self.stages])
+        writes = np.array([stage.writes for stage in self.stages])
+        return reads[:, None] == writes
 
     def take(self, numbers: list[int]) -> "FlatTableau":
         """The tableau with only the stages with these numbers, in this order."""
@@ -141,26 +138,25 @@ class AbstractTableau(abc.ABC):
     def __post_init__(self):
         """Replaces coefficients by checked, read-only arrays. Raises a `ValueError` for
         wrong shapes, or numbers that are not real and finite."""
-        # The length that belongs to a letter is taken from the first field that cannot be a
-        # dictionary and whose first axis has the letter. (A number in place of a vector has
-        # size 1. Its shape is refused below.)
+        # First, the length that belongs to each letter. It is that of the first field that
+        # cannot be a dictionary and whose first axis has the letter.
         lengths = {}
         for name, axes in self._axes.items():
             if name not in self._by_variable:
-                value = getattr(self, name)
-                length = np.size(value) if len(axes) == 1 else len(value)
-                lengths.setdefault(axes[0], length)
+                # A number counts as one entry. Its shape is refused below.
+                rows = np.atleast_1d(getattr(self, name))
+                lengths.setdefault(axes[0], len(rows))
+        # Second, all fields are checked against these lengths. A field by random variable
+        # becomes a dictionary, if it is not one already.
         for name, axes in self._axes.items():
             shape = tuple(lengths[axis] for axis in axes)
             value = getattr(self, name)
             if name in self._by_variable:
                 arrays = value if isinstance(value, Mapping) else {"W": value}
-                checked = {
-                    variable: _checked_coefficients(
-                        f"{name}[{variable!r}]", array, shape
-                    )
-                    for variable, array in arrays.items()
-                }
+                checked = {}
+                for variable, array in arrays.items():
+                    label = f"{name}[{variable!r}]"
+                    checked[variable] = _checked_coefficients(label, array, shape)
             else:
                 checked = _checked_coefficients(name, value, shape)
             # A frozen dataclass refuses `self.name = checked`.
@@ -186,8 +182,7 @@ def _side_by_side(
     # A dictionary keeps the order of first appearance. The order of a set would differ from
     # run to run.
     variables = list(dict.fromkeys([*B, *beta]))
-    zeros = np.zeros(shape)
-    all_B = [B.get(variable, zeros) for variable in variables]
+    all_B = [B.get(variable, np.zeros(shape)) for variable in variables]
     all_beta = [beta.get(variable, np.zeros(shape[1])) for variable in variables]
     return variables, np.concatenate(all_B, axis=1), np.concatenate(all_beta)
 
@@ -267,8 +262,8 @@ class GeneralTableau(AbstractTableau):
         return cls(alpha=alpha, beta=beta, A0=A, B0=B, A1=A, B1=B)
 
     def flatten(self) -> FlatTableau:
-        # Drift and noise have separate stages, since their numbers may differ. The plan of
-        # a step merges stages that are evaluated at the same time and state.
+        # Drift and noise have separate stages, since their numbers may differ. A plan
+        # merges drift and noise stages again if their times and states are the same.
         drift = _stages_at(self.A0.sum(axis=1), ("h",), reads="y", writes="y")
         noise = _stages_at(self.A1.sum(axis=1), self.noise, reads="y", writes="y")
         return FlatTableau(
@@ -372,13 +367,12 @@ class PartitionedTableau(AbstractTableau):
         num_velocities, num_forces = self.A.shape
         shape = (num_velocities, len(self.A1))
         variables, B0, beta = _side_by_side(self.B0, self.beta, shape)
-        # Forces come first: a plan prefers the first stages as unknowns, and forces cost
-        # more to evaluate than velocities.
+        # Forces come first: of several choices for the stages to solve for, a plan takes
+        # the first ones. Forces cost more to evaluate than velocities.
         forces = _stages_at(self.A_hat.sum(axis=1), ("h",), reads="q", writes="p")
         # Velocities do not depend on time. All have the same time, so that a plan can merge
         # velocities at equal momenta.
-        zeros = np.zeros(num_velocities)
-        velocities = _stages_at(zeros, ("h",), reads="p", writes="q")
+        velocities = _stages_at(np.zeros(num_velocities), ("h",), reads="p", writes="q")
         # Each random variable has noise stages of its own, all at the same times and
         # positions.
         noise = []

@@ -121,6 +121,7 @@ def test_parameters_and_tableaus_that_are_none_are_refused():
     tableau = ds.ImplicitMidpoint().tableau
     for change, message in (
         (dict(A0=np.ones((2, 2))), r"`A0` must have shape \(1, 1\)"),
+        (dict(A0=0.5), r"`A0` must have shape \(1, 1\); got shape \(\)"),
         (dict(beta=[np.nan]), "`beta` must be finite"),
         (dict(alpha=[1j]), "`alpha` must be real"),
         (dict(noise="W"), "`noise` must hold the names"),
