@@ -15,12 +15,12 @@ from jaxtyping import Array, Bool, PyTree
 
 from ._arguments import whole_number
 from ._compat import (
+    lax_while_loop,
     reversed_in_time,
     run_steps,
     saves_states,
     solve_state,
     StepTimes,
-    while_loop,
     with_only_ys_differentiable,
     with_y,
     without_derivatives,
@@ -93,20 +93,16 @@ class ReversingAdjoint(diffrax.AbstractAdjoint):
             )
         check_unconstrained(terms, "ReversingAdjoint")
         _check_supported(solver, stepsize_controller, event, saveat)
-        # No derivatives pass through the solver state, which each step of the backward pass
-        # computes anew.
+        # Derivatives are with respect to `inputs` alone. In particular none pass through
+        # the solver state, which each step of the backward pass computes anew.
+        inputs = (init_state.y, args, terms, solver)
         kwargs |= dict(
             stepsize_controller=stepsize_controller,
             saveat=saveat,
-            init_state=without_derivatives(init_state, _without_gradient),
+            init_state=without_derivatives(init_state),
         )
-        differentiated = (init_state.y, args, terms, solver)
-        final_state, aux_stats = _solve(differentiated, adjoint=self, **kwargs)
+        final_state, aux_stats = _solve(inputs, adjoint=self, **kwargs)
         return with_only_ys_differentiable(final_state), aux_stats
-
-
-def _without_gradient(x: Any) -> Any:
-    return lax.stop_gradient(x) if eqx.is_array(x) else x
 
 
 ReversingAdjoint.__init__.__doc__ = """**Arguments:**
@@ -165,21 +161,26 @@ def _undoes_its_steps(solver: Any) -> bool:
     return is_solver(solver) and solver.undoes_its_steps
 
 
-# Equinox calls the rules for the forward and the backward pass below with the same
-# arguments: `inputs` are differentiated, keyword arguments are not.
+# Equinox calls `_solve` and its rules for the forward and the backward pass with the same
+# arguments. It differentiates with respect to the first one, `inputs = (y0, args, terms,
+# solver)`, but not with respect to the keyword arguments. They are those that Diffrax
+# passes to `ReversingAdjoint.loop`, and the adjoint.
 @eqx.filter_custom_vjp
 def _solve(inputs, *, adjoint, throw, **kwargs):
+    """Solves the equation. Returns the final state of Diffrax's loop over steps, and
+    statistics."""
     del throw
-    return _run(adjoint, inputs, ft.partial(while_loop, kind="lax"), kwargs)
+    return _loop_over_steps(adjoint, inputs, kwargs, lax_while_loop)
 
 
-def _run(adjoint: ReversingAdjoint, inputs: Any, outer_while_loop: Callable, kwargs):
-    """The final state of Diffrax's loop, and statistics. `inputs` are what is
-    differentiated: the initial state, `args`, terms and solver. `kwargs` are the other
-    arguments of `loop`."""
-    y, args, terms, solver = inputs
-    init_state = with_y(kwargs["init_state"], y)
-    kwargs = kwargs | {"init_state": init_state}
+def _loop_over_steps(
+    adjoint: ReversingAdjoint, inputs: Any, kwargs: Any, outer_while_loop: Callable
+) -> Any:
+    """What `_solve` returns, for its `inputs` and keyword arguments. `outer_while_loop` is
+    called for the loop over steps."""
+    y0, args, terms, solver = inputs
+    # `y0` is not in `init_state`, since derivatives are with respect to `inputs` alone.
+    kwargs = kwargs | {"init_state": with_y(kwargs["init_state"], y0)}
     return run_steps(
         adjoint, outer_while_loop, args=args, terms=terms, solver=solver, **kwargs
     )
@@ -202,10 +203,13 @@ class _Residuals(NamedTuple):
 
 @_solve.def_fwd
 def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
+    """Solves the equation, and saves checkpoints on the way. Returns what `_solve` returns,
+    and the residuals."""
     del perturbed, throw
     times = StepTimes(kwargs["stepsize_controller"], kwargs["init_state"])
     steps_between = _steps_between(times, adjoint.checkpoints)
-    # Set by `recording_while_loop`, since Diffrax returns only its own state.
+    # Diffrax calls `recording_while_loop`, and returns only the state of its own loop. So
+    # the checkpoints reach this function through a variable.
     checkpoints = None
 
     def recording_while_loop(cond_fun, body_fun, init_val, **options):
@@ -220,7 +224,7 @@ def _solve_fwd(perturbed, inputs, *, adjoint, throw, **kwargs):
         )
         return final
 
-    out = _run(adjoint, inputs, recording_while_loop, kwargs)
+    out = _loop_over_steps(adjoint, inputs, kwargs, recording_while_loop)
     final_state, _ = out
     final = solve_state(final_state)
     return out, _Residuals(
@@ -247,8 +251,11 @@ def _while_loop_with_checkpoints(
     buffers: Callable,
     **options,
 ) -> tuple[Any, PyTree[Array]]:
-    """Runs Diffrax's loop over steps. Returns the final state of the loop, and the states
-    at every `steps_between` steps, along a first axis of length `num_checkpoints`."""
+    """Runs Diffrax's loop over steps, and saves the state before each step whose number is
+    a multiple of `steps_between`.
+
+    Returns the final state of the loop, and the saved states: arrays with one row for each
+    checkpoint, `num_checkpoints` in all. Rows that are not needed are zero."""
 
     def empty_rows(x: Array) -> Array:
         return jnp.zeros((num_checkpoints, *jnp.shape(x)), x.dtype)
@@ -264,8 +271,8 @@ def _while_loop_with_checkpoints(
         # For states between checkpoints the row is out of range, so that `save` drops them.
         row = jnp.where(rest == 0, row, num_checkpoints)
 
-        def save(x: Array, saved: Array) -> Array:
-            return saved.at[row].set(x, mode="drop")
+        def save(x: Array, rows_of_x: Array) -> Array:
+            return rows_of_x.at[row].set(x, mode="drop")
 
         return body_fun(state), jtu.tree_map(save, before_step.y, rows)
 
@@ -275,27 +282,36 @@ def _while_loop_with_checkpoints(
         return buffers(state)
 
     rows = jtu.tree_map(empty_rows, solve_state(init_val).y)
-    return while_loop(
+    return lax_while_loop(
         is_going,
         record_and_step,
         (init_val, rows),
         buffers=buffers_of_state,
-        kind="lax",
         **options,
     )
 
 
-# From here on, `a_x` is the derivative of the loss with respect to `x`.
-class _Walk(NamedTuple):
-    """The state of the backward pass.
+# At a checkpoint the error of a state is compared with the size of the state: its largest
+# entry, or, if that is larger, this fraction of the size of the next state. So a state near
+# rest has the size of states some steps later, since weak increments may take dozens of
+# steps to move it.
+_SIZE_KEPT_PER_STEP = 0.9
 
-    - `i`: the number of steps from the start.
-    - `y`: the state after these steps.
-    - `a_y`: with respect to `y`, without the effect on the first `num_saved` saved states.
-    - `a_parameters`: with respect to the parameters, through the steps after `y`.
-    - `num_saved`: the number of saved states up to the time of `y`.
-    - `size`: the largest entry of `y`, or if it is larger, `_SIZE_KEPT_PER_STEP` times the
-        size of the next state.
+
+# From here on, `a_x` is the derivative of the loss with respect to `x`. The loss depends on
+# the solution through the saved states.
+class _Walk(NamedTuple):
+    """How far the backward pass has come.
+
+    - `i`: the number of steps of the solve that are still to be undone.
+    - `y`: the state after these `i` steps.
+    - `a_y`: the derivative of the loss with respect to `y`, through the saved states that
+        come later than the first `num_saved`.
+    - `a_parameters`: the derivatives of the loss with respect to those parameters (`args`,
+        terms and solver) that are differentiated, through the steps undone so far.
+    - `num_saved`: the number of saved states whose derivatives are not in `a_y` yet, those
+        up to the time of `y`.
+    - `size`: the size of `y`, as defined at `_SIZE_KEPT_PER_STEP`.
     - `agrees`: whether the pass agreed with all checkpoints so far.
     """
 
@@ -312,6 +328,21 @@ class _Walk(NamedTuple):
 def _solve_bwd(
     residuals: _Residuals, grad_out, perturbed, inputs, *, adjoint, throw, **kwargs
 ):
+    """Returns the derivatives of the loss with respect to the `inputs` of `_solve`.
+
+    - `residuals`: what the forward pass left.
+    - `grad_out`: the derivatives with respect to what `_solve` returned.
+    - `perturbed`: as `inputs`, with `True` in place of what is differentiated, and `False`
+        in place of all else.
+
+    The pass starts from the end of the solution. It undoes a step from `t0` to `t1` so:
+
+    1. A step with negated increments leads back from the state at `t1` to that at `t0`.
+    2. If there is a checkpoint at `t0`, the state is compared with it and replaced by it.
+    3. Derivatives with respect to the states that were saved in the step are added.
+    4. The transposed Jacobian of the step takes derivatives with respect to the state at
+        `t1` to those with respect to the state at `t0` and the parameters.
+    """
     times = StepTimes(kwargs["stepsize_controller"], kwargs["init_state"])
     steps_between = _steps_between(times, adjoint.checkpoints)
     solver_state = times.solver_state()
@@ -335,9 +366,9 @@ def _solve_bwd(
         t1 = times.time(i + 1)
 
         def step(y0: Y, diff: PyTree[Array]) -> Y:
-            parameters = eqx.combine(diff, nondiff)
-            return _y_after_step(parameters, t0, t1, y0, solver_state)
+            return _y_after_step(eqx.combine(diff, nondiff), t0, t1, y0, solver_state)
 
+        # In reversed time the step goes from `-t1` to `-t0`.
         y_found = _y_after_step(parameters_back, -t1, -t0, walk.y, solver_state)
         size = jnp.maximum(optx.max_norm(y_found), _SIZE_KEPT_PER_STEP * walk.size)
         y0, agrees = _meet_checkpoint(
@@ -368,12 +399,13 @@ def _solve_bwd(
         agrees=jnp.array(True),
     )
     start = lax.while_loop(is_going, step_back, end)
-    a_y = saved.added_at_start(start.a_y, start.num_saved)
-    return _checked_gradients(start.agrees, throw, (a_y, *start.a_parameters))
+    a_y0 = saved.added_at_start(start.a_y, start.num_saved)
+    return _checked_gradients(start.agrees, throw, (a_y0, *start.a_parameters))
 
 
 def _y_after_step(parameters: PyTree, t0: Any, t1: Any, y0: Y, solver_state: Any) -> Y:
-    """The state after one step of the solve."""
+    """The state after a step with these `args`, terms and solver. `solver_state` is any
+    state of the solver, for its structure."""
     args, terms, solver = parameters
     # The solver state belongs to another step, so the step is made as after a jump.
     y1, *_ = solver.step(terms, t0, t1, y0, args, solver_state, made_jump=True)
@@ -382,8 +414,9 @@ def _y_after_step(parameters: PyTree, t0: Any, t1: Any, y0: Y, solver_state: Any
 
 def _with_zeros(a_ys: PyTree[Array | None], y1: Y, ts: Array | None) -> PyTree[Array]:
     """`a_ys`, the derivatives with respect to the saved states, with zeros in place of
-    `None`, which JAX passes where the loss does not depend on a leaf. `y1` is one of the
-    states, and `ts` are the times."""
+    `None`. Equinox passes `None` where the loss does not depend on a leaf. `y1` is one of
+    the states, and `ts` are their times, or `None` if only the state at the end is
+    saved."""
     num_times = 1 if ts is None else len(ts)
 
     def or_zeros(y1_leaf: Array, a_leaf: Array | None) -> Array:
@@ -418,20 +451,22 @@ class _SavedStates(NamedTuple):
     a_ys: PyTree[Array]
 
     def at_end(self) -> Y:
-        """The derivatives with respect to the state at the end, before the first step
-        back."""
+        """The `a_y` of the backward pass at the end of the solution. It is zero for states
+        saved at `ts`: the first step back adds those that were saved at its end."""
         if self.ts is None:
             return jtu.tree_map(lambda rows: rows[-1], self.a_ys)
-        # The first step back adds the states that were saved at its end.
         return jtu.tree_map(lambda rows: jnp.zeros_like(rows[0]), self.a_ys)
 
     def added_in_step(self, t0: Any, t1: Any, a_y1: Y, num_saved: Array) -> _StepEnds:
-        """Adds to `a_y1` the derivatives with respect to the states that were saved after
-        `t0` and up to `t1`, the last ones of the first `num_saved`.
+        """Adds the derivatives with respect to the states that were saved in a step: after
+        `t0` and up to `t1`. They are the last ones of the first `num_saved`. `a_y1` is the
+        derivative with respect to the state at `t1`, through states that were saved later.
 
-        Diffrax interpolates these states linearly: the state at the time
-        `t0 + share * (t1 - t0)` is `(1 - share) * y0 + share * y1`."""
-        ends = _StepEnds(a_y1, jtu.tree_map(jnp.zeros_like, a_y1), num_saved)
+        Diffrax interpolates linearly in a step, `y = (1 - share) * y0 + share * y1` at the
+        time `t0 + share * (t1 - t0)`. So a saved state with the derivative `a` adds
+        `share * a` to `a_y1`, and `(1 - share) * a` to `a_y0`."""
+        a_y0 = jtu.tree_map(jnp.zeros_like, a_y1)
+        ends = _StepEnds(a_y1=a_y1, a_y0=a_y0, num_saved=num_saved)
         ts = self.ts
         if ts is None:
             return ends
@@ -455,8 +490,8 @@ class _SavedStates(NamedTuple):
         return lax.while_loop(has_more, add_last, ends)
 
     def added_at_start(self, a_y0: Y, num_saved: Array) -> Y:
-        """Adds to `a_y0` the derivatives with respect to the first `num_saved` states. They
-        were saved at the start of the solve, before any step."""
+        """Adds to `a_y0` the derivatives with respect to the first `num_saved` saved
+        states, which are the initial state, saved before any step."""
         if self.ts is None:
             return a_y0
         is_at_start = jnp.arange(len(self.ts)) < num_saved
@@ -465,12 +500,6 @@ class _SavedStates(NamedTuple):
             return a + jnp.tensordot(is_at_start, rows, 1)
 
         return jtu.tree_map(with_saved, a_y0, self.a_ys)
-
-
-# Errors of a state are compared with its size, which is at least this fraction of the size
-# of the next state. So a state at rest has a size, too, although weak increments may take
-# dozens of steps to move it.
-_SIZE_KEPT_PER_STEP = 0.9
 
 
 def _meet_checkpoint(
@@ -482,11 +511,14 @@ def _meet_checkpoint(
     size: Array,
 ) -> tuple[Y, Bool[Array, ""]]:
     """Compares `y_found`, the state after `i` steps as the backward pass found it, with the
-    checkpoint there, if there is one.
+    checkpoint there. There is one after every `steps_between` steps.
 
-    Returns the checkpoint, or without one `y_found`; and whether the pass `agreed_so_far`
-    and agrees with this checkpoint, too, up to an error in proportion to `size`."""
-    # Between checkpoints this reads the one before, and does not use it.
+    Returns a state and whether the pass agrees with all checkpoints from the end to here:
+
+    - At a checkpoint: its state, and whether the pass `agreed_so_far` and the error of
+        `y_found` is small in comparison with the `size` of the state.
+    - Elsewhere: `y_found` and `agreed_so_far`."""
+    # Elsewhere this reads the checkpoint before, and does not use it.
     row, rest = jnp.divmod(i, steps_between)
     checkpoint = jtu.tree_map(lambda rows: rows[row], checkpoints)
     error = optx.max_norm((y_found**ω - checkpoint**ω).ω)

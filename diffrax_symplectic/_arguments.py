@@ -20,7 +20,8 @@ from ._custom_types import Y
 
 
 _PACKAGE = os.path.dirname(__file__) + os.sep
-# Names of arguments that show that a function takes positions before momenta or velocities.
+# Pairs of names of arguments that show that a function takes positions first, and momenta
+# or velocities second.
 _POSITIONS_FIRST = (("x", "v"), ("x", "p"), ("q", "v"))
 
 
@@ -34,21 +35,24 @@ class ShortTraceback:
         return None
 
     def __exit__(self, kind: Any, error: Any, traceback: Any) -> None:
-        if not isinstance(error, ValueError) or _shows_all_frames():
+        shows_all_frames = jax.config.jax_traceback_filtering == "off"  # pyright: ignore
+        if not isinstance(error, ValueError) or shows_all_frames:
             return
         # The last frame is that of the line that raised the error. The first frame is that
-        # of the function in which this context stands, and is the only one to be kept.
+        # of the function whose code is in this context. Only the first frame is kept.
         if extract_tb(traceback)[-1].filename.startswith(_PACKAGE):
             traceback.tb_next = None
 
 
-def _shows_all_frames() -> bool:
-    """Whether the user has switched off JAX's filter of tracebacks."""
-    return jax.config.jax_traceback_filtering == "off"  # pyright: ignore
-
-
 def check_takes(name: str, fn: Any, *arguments: str) -> None:
-    """Raises a `ValueError` unless `fn` takes these arguments, in this order."""
+    """Raises a `ValueError` unless `fn`, the argument of this name of a function of this
+    package, can be called with these `arguments` by position. They are the names that the
+    documentation uses, such as `"t", "p", "q", "args"`. Refused are
+
+    - anything that is no function;
+    - a function of fewer arguments, or with more that have no default;
+    - a function whose parameters have these names in another order, such as `H(t, q, p)`.
+    """
     usage = f"`{name}({', '.join(arguments)})`"
     if not callable(fn):
         raise ValueError(f"`{name}` must be a function, called as {usage}; got {fn!r}.")
@@ -64,6 +68,16 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
             f"`{name}` is called as {usage}; got a function with other arguments, "
             f"`{signature}`."
         ) from None
+    if _has_other_order(signature, arguments):
+        raise ValueError(
+            f"`{name}` is called as {usage}; got a function with its arguments in another "
+            f"order, `{signature}`."
+        )
+
+
+def _has_other_order(signature: inspect.Signature, arguments: tuple[str, ...]) -> bool:
+    """Whether the names of a function's parameters show that it takes the arguments in
+    another order. Shapes would not show it, since momenta and positions are alike."""
     by_position = (
         inspect.Parameter.POSITIONAL_ONLY,
         inspect.Parameter.POSITIONAL_OR_KEYWORD,
@@ -73,31 +87,21 @@ def check_takes(name: str, fn: Any, *arguments: str) -> None:
         for parameter in signature.parameters.values()
         if parameter.kind in by_position
     ]
-    if _have_other_order(names, arguments):
-        raise ValueError(
-            f"`{name}` is called as {usage}; got a function with its arguments in another "
-            f"order, `{signature}`."
-        )
-
-
-def _have_other_order(names: list[str], arguments: tuple[str, ...]) -> bool:
-    """Whether the names of a function's parameters show that it takes the arguments in
-    another order."""
-    # The parameters may have other names. But a name that is one of `arguments` must be in
-    # its place: shapes would not show the mistake, since momenta and positions are alike.
+    # A parameter may have any name, such as `momenta` for `p`. But if it has the name of
+    # another argument, the order is wrong.
     is_any_misplaced = any(
         name in arguments and name != argument
         for name, argument in zip(names, arguments)
     )
-    # Momenta and positions come after the time.
+    # The first argument is the time.
     takes_momenta_first = arguments[1:3] == ("p", "q")
     has_positions_first = tuple(names[1:3]) in _POSITIONS_FIRST
     return is_any_misplaced or (takes_momenta_first and has_positions_first)
 
 
 def takes_args(fn: Any) -> bool:
-    """Whether a function is called as `fn(key, args)`, not as `fn(key)`: with a parameter
-    named `args`, or with a second one that has no default."""
+    """Whether a function is to be called as `fn(key, args)`, and not as `fn(key)`. It is if
+    it has a parameter named `args`, or two parameters without a default."""
     try:
         parameters = inspect.signature(fn).parameters
     except ValueError:
@@ -128,11 +132,11 @@ def check_solver(name: str, solver: Any) -> None:
 
 def check_made_for_noise(solver: diffrax.AbstractSolver) -> None:
     """Raises a `ValueError` for solvers of Diffrax that are for equations without noise, or
-    that wrap another solver. Solvers from elsewhere need not say which equations they are
-    for."""
+    that wrap another solver. Solvers from elsewhere are accepted, since they need not say
+    which equations they are for."""
     kinds = diffrax.AbstractItoSolver | diffrax.AbstractStratonovichSolver
     is_of_diffrax = type(solver).__module__.startswith("diffrax.")
-    # `issubclass`, since `isinstance` takes a `diffrax.HalfSolver` for the solver in it.
+    # Not `isinstance`, which checks the solver in a `diffrax.HalfSolver` in its place.
     if is_of_diffrax and not issubclass(type(solver), kinds):
         raise ValueError(
             "`solver` must take fixed steps and be for equations with noise, as those of "
@@ -150,11 +154,12 @@ def check_terms(terms: Any) -> None:
 
 
 def check_args(args: Any) -> None:
-    """Raises a `ValueError` for `args` of which no program can be compiled."""
+    """Raises a `ValueError` for `args` that cannot be passed to a compiled program. A leaf
+    is either numeric, and becomes an input of the program, or becomes a constant of the
+    program, such as a string or a function."""
     for leaf in jtu.tree_leaves(args):
-        # Leaves other than numbers, such as strings and functions, become constants of the
-        # program. They must have a hash, by which the program is found. An iterator has
-        # one, but yields other values each time.
+        # The program is found by the hashes of its constants. An iterator has a hash, but
+        # yields other values each time. An array that is not numeric is no constant.
         has_fixed_value = isinstance(leaf, Hashable) and not isinstance(leaf, Iterator)
         is_constant = has_fixed_value and not eqx.is_array_like(leaf)
         if not (is_numeric(leaf) or is_constant):
@@ -176,8 +181,8 @@ def check_numbers(name: str, tree: PyTree) -> None:
 
 
 def is_numeric(leaf: Any) -> bool:
-    """Whether JAX takes this for an array of numbers."""
-    # Objects, text and dates, of which JAX has no arrays.
+    """Whether JAX takes this for a number or an array of numbers."""
+    # Codes of NumPy for objects, text, dates and times, of which JAX has no arrays.
     has_objects = getattr(leaf, "dtype", np.dtype(float)).kind in "OSUMm"
     return eqx.is_array_like(leaf) and not has_objects
 
@@ -201,8 +206,8 @@ def check_memory(
     name: str, number: int, bytes_of_each: int, device: Any = None
 ) -> None:
     """Raises a `ValueError` if the argument of this name asks for more paths at once than
-    fit in the memory of a device, by default of this machine. A path takes `bytes_of_each`
-    or more."""
+    fit in the memory of a device, or without a `device` in that of this machine. `number`
+    is its value, the number of paths. A path takes `bytes_of_each` or more."""
     needed = number * bytes_of_each
     memory = _memory_of(device)
     if needed > memory:
@@ -225,8 +230,9 @@ def _memory_of(device: Any) -> int | float:
 
 
 def check_real(name: str, leaves: list) -> None:
-    """Raises a `ValueError` unless the function of this name returned real arrays. `leaves`
-    are the leaves of what it returned: arrays, numbers or structs of arrays."""
+    """Raises a `ValueError` unless the function of this name returned real arrays, none of
+    them empty. `leaves` are the leaves of what it returned: numbers, arrays, or instances
+    of `jax.ShapeDtypeStruct` in their place."""
     if len(leaves) == 0:
         raise ValueError(f"`{name}` must return real arrays; it returned none.")
     if any(np.size(leaf) == 0 for leaf in leaves if hasattr(leaf, "shape")):
@@ -251,8 +257,8 @@ def _is_real(dtype: Any) -> bool:
 
 def checked_not_negative(name: str, value: Any, *, expected: str) -> ArrayLike:
     """Returns the value of the argument of this name. Raises a `ValueError` unless it is a
-    real number or array. If it is known while tracing, it must also be finite and not
-    negative. `expected` is for the message, such as "a number"."""
+    real number or array. Unless it is traced, it must also be finite and not negative.
+    `expected` says in the message what it must be, such as "a number"."""
     is_allowed = is_real_number(value)
     if is_allowed and not is_traced(value):
         values = np.asarray(value)
@@ -268,14 +274,13 @@ def is_real_number(value: Any) -> bool:
     """Whether this is a real number, or an array of real numbers. Booleans do not count,
     since a mask in place of a number is a mistake."""
     dtype = getattr(value, "dtype", type(value))
-    kinds = (jnp.floating, jnp.integer)
-    has_real_dtype = any(jnp.issubdtype(dtype, kind) for kind in kinds)
+    has_real_dtype = _is_real(dtype) and not jnp.issubdtype(dtype, jnp.bool_)
     return eqx.is_array_like(value) and has_real_dtype
 
 
 def check_untraced(caller: str, tree: Any) -> None:
-    """Raises a `ValueError` if any array is known only when a program runs. `caller` is for
-    the message, such as "`ensemble`", in backticks."""
+    """Raises a `ValueError` if any array is traced, that is, known only when a program
+    runs. `caller` is the function's name for the message, in backticks."""
     if any(is_traced(x) for x in jtu.tree_leaves(tree)):
         raise inside_jax(caller)
 

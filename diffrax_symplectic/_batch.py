@@ -37,34 +37,37 @@ def largest_in_batch(number: IntScalarLike) -> IntScalarLike:
 def _(size, in_batched, number):
     del size
     largest = jnp.max(number, 0) if in_batched[0] else number
-    # The function is called again for outer batches, which may have other numbers.
+    # The batch may be one of several in an outer batch, each with its own largest number.
     return largest_in_batch(largest), False
 
 
 def batched_like(values: _T, others: PyTree) -> _T:
-    """The same `values`, batched if any array in `others` is.
+    """The same `values`. Under `vmap`, all of them become batched if any array in `values`
+    or `others` is.
 
     JAX traces a loop again whenever one more of its values turns out to be batched, and
     nested loops again each time. Batching the initial values before the loop halves the
     time to trace `StrangGauss`.
     """
     arrays = [leaf for leaf in jtu.tree_leaves(others) if eqx.is_array(leaf)]
-    # `custom_jvp` does not convert arrays of NumPy, over which a user may have batched.
+    # `_batched_together` takes no arrays of NumPy, over which a user may have batched.
     # `jnp.array` converts them, without an operation in the program.
-    return _batched(*jtu.tree_map(jnp.array, (values, arrays)))
+    return _batched_together(*jtu.tree_map(jnp.array, (values, arrays)))
 
 
 @jax.custom_batching.custom_vmap
-def _all_or_none(values: _T, others: list[Array]) -> _T:
+def _batched_without_derivative(values: _T, others: list[Array]) -> _T:
+    """Returns `values`. Its rule for `vmap` makes all of them batched."""
     del others
     return values
 
 
-@_all_or_none.def_vmap
+@_batched_without_derivative.def_vmap
 def _(size, in_batched, values, others):
-    # JAX calls this rule only if anything is batched. Then all values become batched.
-    repeated = _repeated(size, in_batched[0], values)
-    return _all_or_none(repeated, others), _all_batched(values)
+    # JAX calls this rule only if anything is batched.
+    are_values_batched, _ = in_batched
+    repeated = _repeated(size, are_values_batched, values)
+    return _batched_without_derivative(repeated, others), _all_batched(values)
 
 
 def _repeated(size: int, is_batched: PyTree[bool], values: _T) -> _T:
@@ -81,18 +84,20 @@ def _all_batched(values: PyTree) -> PyTree[bool]:
     return jtu.tree_map(lambda _: True, values)
 
 
-# Custom batching rules cannot be differentiated in reverse mode.
-_batched = jax.custom_jvp(_all_or_none)
+# JAX cannot differentiate a custom batching rule in reverse mode. So the function has a
+# rule for derivatives, too: that of the identity.
+_batched_together = jax.custom_jvp(_batched_without_derivative)
 
 
-@_batched.defjvp
+@_batched_together.defjvp
 def _(primals, tangents):
-    return _batched(*primals), tangents[0]
+    values_dot, _ = tangents
+    return _batched_together(*primals), values_dot
 
 
 def error_if_alone(pred: Bool[Array, ""], message: str) -> Bool[Array, ""]:
-    """Returns `pred`. If it is true, raises an error when run, except under `vmap`, where
-    an error of one path would stop all others of its batch."""
+    """Returns `pred`. If it is true, raises an error when run. Under `vmap` it only returns
+    `pred`, since an error of one path would stop all others of its batch."""
 
     @jax.custom_batching.custom_vmap
     def checked(pred):
@@ -107,8 +112,8 @@ def error_if_alone(pred: Bool[Array, ""], message: str) -> Bool[Array, ""]:
 
 
 def refused_where(fault: Bool[Array, ""], advice: str) -> Bool[Array, ""]:
-    """Returns `fault`. If it is true, raises a `ValueError` with this advice. If it is not
-    known while tracing, it is checked when run, as by `error_if_alone`."""
+    """Returns `fault`. If it is true, raises a `ValueError` with this advice. If `fault` is
+    not known while tracing, it is checked when run, by `error_if_alone`."""
     if is_traced(fault):
         return error_if_alone(fault, advice)
     if fault:
@@ -120,26 +125,29 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
     """`fn(value)` where `pending`, and `value` elsewhere. Not differentiable.
 
     Under `vmap` a conditional becomes a select: all paths compute, with memory for all.
-    Here the stragglers, the paths that are `pending`, are gathered from the batch and
-    served in groups.
+    Here only the stragglers compute, the paths that are `pending`:
+
+    1. A single path counts as a batch of one path.
+    2. Under `vmap`, the batches are joined into one batch of all paths.
+    3. `_in_groups` gathers the stragglers from the batch and calls `fn` for them.
     """
     # `fn` is traced once, here: under `vmap`, `jax.jit` would trace it again.
     call, arrays = with_captured_arrays(fn, value)
     # Each level of nested batches runs the same program.
     in_groups = jax.jit(ft.partial(_in_groups, call))
 
-    # Of the arrays that `fn` captures, `own_arrays` have a leading axis for the paths, and
-    # `common_arrays` are the same for all paths. Both have the structure of `arrays`, with
-    # `None` in place of arrays in the other.
+    # All arguments but the last are of a batch: they have a leading axis for the paths. Of
+    # the arrays that `fn` captures, `own_arrays` differ between paths, and `common_arrays`
+    # are the same for all paths. Both have the structure of `arrays`, with `None` in place
+    # of arrays in the other.
     @jax.custom_batching.custom_vmap
     def serve(pending, value, own_arrays, common_arrays):
         return in_groups(pending, value, own_arrays, common_arrays)
 
-    # Nested batches are joined into one, so that stragglers of all share the groups: arrays
-    # of paths, of shape `(outer, inner, ...)`, become `(outer * inner, ...)`.
+    # `vmap` adds an outer axis. Both axes become one: arrays of paths, of shape
+    # `(outer, inner, ...)`, are reshaped to `(outer * inner, ...)`.
     @serve.def_vmap
     def _(outer_size, in_batched, pending, value, own_arrays, common_arrays):
-        # All arguments but the last have an axis for the inner paths.
         *are_paths_batched, are_common_batched = in_batched
         paths = _repeated(outer_size, are_paths_batched, [pending, value, own_arrays])
         _, inner_size = paths[0].shape
@@ -150,8 +158,8 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
         def separate_axes(x: Array) -> Array:
             return x.reshape(outer_size, inner_size, *x.shape[1:])
 
-        # A common array that differs between outer batches is no longer common. It is
-        # repeated for the inner paths.
+        # A common array with the outer axis is no longer common. It is repeated for the
+        # inner paths.
         def own_if_batched(is_batched: bool, x: Array) -> Array | None:
             return jnp.repeat(x, inner_size, axis=0) if is_batched else None
 
@@ -165,7 +173,7 @@ def where_pending(fn: Callable[[_T], _T], pending: Bool[Array, ""], value: _T) -
         )
         return jtu.tree_map(separate_axes, joined_value), _all_batched(value)
 
-    # One path is a batch of one, and all captured arrays are common.
+    # All captured arrays are common to the one path of its batch.
     no_own_arrays = jtu.tree_map(lambda _: None, arrays)
     pending, value = _with_axis((pending, value))
     return _first(serve(pending, value, no_own_arrays, arrays))
@@ -176,7 +184,7 @@ def _none_if_batched(is_batched: bool, x: Array) -> Array | None:
 
 
 def _with_axis(tree: _T) -> _T:
-    """The arrays as those of a batch of one."""
+    """The arrays of one path as those of a batch of one path."""
     return jtu.tree_map(lambda x: x[None], tree)
 
 
@@ -192,8 +200,11 @@ def _in_groups(
     own_arrays: PyTree[Array | None],
     common_arrays: PyTree[Array | None],
 ) -> _T:
-    """`value` of a batch, with `call` applied for the paths that are `pending`. The arrays
-    are as in `where_pending`: together they are the second argument of `call`."""
+    """`value` of a batch, with `call` applied for the paths that are `pending`. The loop
+    takes one group of pending paths after another, until none is pending.
+
+    The second argument of `call` consists of the `own_arrays` of a path and the
+    `common_arrays`, as `where_pending` describes them."""
     size = len(pending)
     # The quotient is rounded up, so that a small batch has groups of one.
     group_size = -(-size // _MOST_GROUPS)
@@ -215,11 +226,12 @@ def _in_groups(
         """Applies `call` for the next group of pending paths, which are then no longer
         pending."""
         pending, value = carry
-        # The indices of the first pending paths are those of the largest entries of zeros
-        # and ones. (`jnp.nonzero` compiles to a dozen kernels.) If fewer paths are pending
-        # than a group has, the others get the index `size`, which is beyond the batch, so
-        # that `scatter` drops them. Unsigned indices need no code for negative ones.
+        # The first pending paths are the largest entries of `pending` as zeros and ones.
+        # (`jnp.nonzero` would find them, but compiles to a dozen kernels.)
         is_pending, first = lax.top_k(pending.astype(jnp.float32), group_size)
+        # If fewer paths are pending than a group has, the others get the index `size`,
+        # which is beyond the batch, so that `scatter` drops them. Unsigned indices need no
+        # code for negative ones.
         indices = jnp.where(is_pending > 0, first, size).astype(jnp.uint32)
         gathered = jtu.tree_map(lambda x: x[indices], (value, own_arrays))
         values_of_group = jax.vmap(call_for_path)(*gathered)
@@ -243,13 +255,13 @@ def materialize(fn: Callable[[], _T]) -> _T:
 
     On CPUs, XLA may fuse a computation into every kernel that reads its result, and so
     repeat it. For Gaussian numbers and transcendental functions this costs more than it
-    saves. XLA does not fuse across the boundary of a conditional, so `fn` is called in one
-    branch of a conditional, and a barrier hides that the condition is always true.
+    saves. XLA does not fuse across the boundary of a conditional. So on CPUs the result is
+    `cond(True, fn, zeros)`, where a barrier hides from XLA that the condition is true.
     """
 
-    # With `jit`, `fn` is traced once for all three uses of `once` below. (The wrapper is a
-    # function, since JAX prints the name of what it traces. For a bound method it prints
-    # the whole object to which the method is bound, which takes 50 ms each time.)
+    # With `jit`, `fn` is traced once for all three uses of `once` below. (`jit(fn)` would
+    # do, but JAX prints the name of what it traces, and for a bound method the whole object
+    # to which the method is bound, which takes 50 ms each time.)
     @jax.jit
     def once() -> _T:
         return fn()

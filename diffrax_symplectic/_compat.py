@@ -23,7 +23,7 @@ from diffrax._term import AdjointTerm, WrapTerm
 from equinox.internal import (
     nondifferentiable as nondifferentiable,
     nondifferentiable_backward as nondifferentiable_backward,
-    while_loop as while_loop,
+    while_loop,
     ω as ω,
 )
 from jax.extend.core import (
@@ -39,6 +39,9 @@ from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from ._parts import parts_of, with_parts
 
+
+# Equinox's loop without derivatives, which can write arrays in place.
+lax_while_loop = ft.partial(while_loop, kind="lax")
 
 # Operations that only call a function, and the parameter that holds the function.
 CALLS = {
@@ -64,8 +67,8 @@ def is_traced(x: Any) -> bool:
 
 
 def at_trace_time() -> Any:
-    """A context in which operations on known values are carried out at once, even inside of
-    `jax.jit`, so that their results are known while tracing."""
+    """A context in which operations on values that are not traced are carried out at once,
+    even inside of `jax.jit`, so that their results are known while tracing."""
     return jax.ensure_compile_time_eval()
 
 
@@ -77,8 +80,8 @@ def is_result(x: Any) -> bool:
 
 def is_closure_mismatch(error: ValueError) -> bool:
     """Whether Equinox raised the error because a closure that it had converted was called
-    with arrays of another type, as on several devices. It has no class of errors for
-    this."""
+    with arrays of another type, as on several devices."""
+    # Equinox has no class of errors for this.
     return "Closure-converted function" in str(error)
 
 
@@ -156,16 +159,17 @@ def is_adjoint_term(term: diffrax.AbstractTerm) -> bool:
 def with_captured_arrays(fn: Callable, value: PyTree) -> tuple[Callable, list[Any]]:
     """Returns a function `call` and the arrays that `fn` captures, such that
     `call(value, arrays)` is `fn(value)`.
-    (`eqx.filter_closure_convert` would refuse the arrays under `shard_map`, which changes
-    the types that it checks.)"""
-    traced, struct = jax.make_jaxpr(fn, return_shape=True)(value)
+
+    (`eqx.filter_closure_convert` does this, too, but checks the types of the arrays. Under
+    `shard_map` it would refuse them, since their types change there.)"""
+    program, struct = jax.make_jaxpr(fn, return_shape=True)(value)
     result_treedef = jtu.tree_structure(struct)
 
     def call(value: PyTree, arrays: list[Any]) -> PyTree:
-        results = evaluated(traced.jaxpr, arrays, jtu.tree_leaves(value))
+        results = evaluated(program.jaxpr, arrays, jtu.tree_leaves(value))
         return result_treedef.unflatten(results)
 
-    return call, traced.consts
+    return call, program.consts
 
 
 def is_program(x: Any) -> bool:
@@ -176,8 +180,8 @@ def is_program(x: Any) -> bool:
 def is_rule(x: Any) -> bool:
     """Whether a parameter of an operation is a function, such as the rule of a custom
     derivative, or a callback."""
-    # Types and meshes of devices are callable, but no functions. JAX wraps some functions
-    # in an object that is not callable, and has the function as `call_wrapped`.
+    # Types and meshes of devices are callable, but no rules. Some functions are wrapped by
+    # JAX in an object that is not callable, and has the function as `call_wrapped`.
     if isinstance(x, type | jax.sharding.Mesh):
         return False
     return callable(x) or hasattr(x, "call_wrapped")
@@ -202,18 +206,19 @@ class OperandPlace(NamedTuple):
 def with_constants_at(
     jaxpr: Jaxpr, places: Sequence[OperandPlace]
 ) -> tuple[Jaxpr, list[Any]]:
-    """The program that reads a new constant in each of these places, and the values that it
-    read there before. The new constants come after those that the program has."""
-    # The results of the program come last, at the index `RESULTS`.
-    operands: list[list[Any]] = [list(eqn.invars) for eqn in jaxpr.eqns]
-    operands.append(list(jaxpr.outvars))
-    replaced = [operands[place.operation][place.position] for place in places]
+    """The program with a new constant in each of these places, and what it reads there now.
+    The new constants come after those that the program has, in the order of `places`."""
+    # For each operation what it reads, and at the last index, `RESULTS`, what the program
+    # returns.
+    reads: list[list[Any]] = [list(eqn.invars) for eqn in jaxpr.eqns]
+    reads.append(list(jaxpr.outvars))
+    replaced = [reads[place.operation][place.position] for place in places]
     structs = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in replaced]
     constants = _variables_like(*structs)
     for place, constant in zip(places, constants):
-        operands[place.operation][place.position] = constant
-    *operands_of_eqns, results = operands
-    eqns = [eqn.replace(invars=xs) for eqn, xs in zip(jaxpr.eqns, operands_of_eqns)]
+        reads[place.operation][place.position] = constant
+    *operands, results = reads
+    eqns = [eqn.replace(invars=xs) for eqn, xs in zip(jaxpr.eqns, operands)]
     constvars = [*jaxpr.constvars, *constants]
     jaxpr = jaxpr.replace(eqns=eqns, outvars=results, constvars=constvars)
     return jaxpr, replaced
@@ -232,9 +237,9 @@ _number_of_traces = jax.make_user_context(0)
 
 
 def with_traces_of(number: int) -> Any:
-    """A context in which JAX uses a trace again only if it was made in a context of the
-    same number. Elsewhere JAX uses the trace of an inner function, such as
-    `diffrax.diffeqsolve`, again whenever its arguments are the same objects, although a
+    """A context in which JAX uses a trace again only if the trace was made in a context of
+    the same number. Outside of such contexts JAX uses the trace of an inner function, such
+    as `diffrax.diffeqsolve`, again whenever its arguments are the same objects, although a
     function among them may compute something else by now."""
     return _number_of_traces(number)
 
@@ -252,7 +257,8 @@ def programs_in(eqn: JaxprEqn) -> list[Jaxpr]:
 
 
 def results_of_operation(eqn: JaxprEqn, args: Sequence[Any], params: Any) -> list[Any]:
-    """The results of one operation of a jaxpr, with these parameters."""
+    """The results of an operation of a jaxpr for these arguments, with `params` in place of
+    its own parameters."""
     bind_params = eqn.primitive.get_bind_params(params)
     functions = ()
     # Some versions of JAX return a pair: functions, which `bind` takes before the other
@@ -269,10 +275,12 @@ def results_of_program(
     args: Sequence[Any],
     results_of: Callable[[JaxprEqn, list[Any]], Sequence[Any]],
 ) -> list[Any]:
-    """The results of a program for these arguments, operation by operation. The results of
-    each operation are `results_of(eqn, args)`, for the arguments of this operation."""
+    """The results of a program for these arguments, operation by operation.
+    `results_of(eqn, args)` computes the results of one operation for its arguments."""
+    # A `Jaxpr` has no constants.
     jaxpr = getattr(program, "jaxpr", program)
     consts = getattr(program, "consts", [])
+    # The values of variables so far.
     values = dict(zip(jaxpr.constvars, consts)) | dict(zip(jaxpr.invars, args))
 
     def value_of(atom: Any) -> Any:
@@ -331,11 +339,11 @@ def solve_state(loop_state: Any) -> SolveState:
     )
 
 
-def without_derivatives(loop_state: Any, stop_gradient: Callable) -> Any:
-    """A state of Diffrax's loop through which no derivatives pass: without the state of the
-    equation, and with `stop_gradient(x)` in place of each leaf `x` of the solver's
-    state."""
-    solver_state = jtu.tree_map(stop_gradient, loop_state.solver_state)
+def without_derivatives(loop_state: Any) -> Any:
+    """A state of Diffrax's loop without the state `y` of the equation, and without
+    derivatives through the state of the solver. `with_y` adds a state of the equation."""
+    dynamic, static = eqx.partition(loop_state.solver_state, eqx.is_array)
+    solver_state = eqx.combine(jax.lax.stop_gradient(dynamic), static)
     # `y` becomes an object that is no array, so that using it by mistake is an error.
     return dataclasses.replace(loop_state, y=object(), solver_state=solver_state)
 
@@ -354,13 +362,13 @@ def with_only_ys_differentiable(loop_state: Any) -> Any:
 
 
 def run_steps(adjoint: Any, outer_while_loop: Callable, **kwargs: Any) -> Any:
-    """Runs Diffrax's loop over steps for an adjoint. `outer_while_loop` loops over steps,
-    and an ordinary loop over the times to save at. `kwargs` are those of
-    `adjoint.loop`."""
+    """Runs Diffrax's loop over steps for an adjoint. It calls `outer_while_loop` for the
+    loop over steps. Inside of it is a loop over the times to save at, without derivatives.
+    `kwargs` are those of `adjoint.loop`."""
     return adjoint._loop(
         **kwargs,
         event=None,
-        inner_while_loop=ft.partial(while_loop, kind="lax"),
+        inner_while_loop=lax_while_loop,
         outer_while_loop=outer_while_loop,
     )
 
@@ -393,11 +401,12 @@ class StepTimes(NamedTuple):
         """The time after `i` steps."""
         if isinstance(self.controller, diffrax.StepTo):
             return self.controller.ts[i]
+        # The state of a constant step size begins with the number of steps so far. After
+        # `i - 1` steps the controller is asked for the times of the next step, of which
+        # only the end is used here.
         _, *other_state = self.init_state.controller_state
         initial_time = self.init_state.tprev
         time_after_first_step = self.init_state.tnext
-        # The controller is asked for the step after `i - 1` steps, the first entry of its
-        # state. Of its results only the end of that step is used.
         _, _, time_after_step, *_ = self.controller.adapt_step_size(
             t0=initial_time,
             t1=time_after_first_step,

@@ -51,19 +51,26 @@ def lapack_in_turn(fn: Callable) -> Callable:
     def call(*args: Any) -> Any:
         if not has_blocking_lapack():
             return fn(*args)
-        traced, dynamic, static = eqx.filter_make_jaxpr(fn)(*args)
+        # The leaves of what `fn` returns: arrays in `dynamic`, all others in `static`.
+        program, dynamic, static = eqx.filter_make_jaxpr(fn)(*args)
         arrays = jtu.tree_leaves(eqx.filter(args, eqx.is_array))
-        outs = _run_in_turn(traced, arrays)
+        results = _run_in_turn(program, arrays)
         treedef = jtu.tree_structure(dynamic)
-        return eqx.combine(treedef.unflatten(outs), static)
+        return eqx.combine(treedef.unflatten(results), static)
 
     return call
 
 
 def _run_in_turn(program: Jaxpr | ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
-    """The results of a program for these arguments. Each call of LAPACK waits for the call
-    before."""
-    # The results of the last call of LAPACK so far.
+    """The results of a program for these arguments, operation by operation. An operation
+    that contains a call of LAPACK is treated by its kind:
+
+    - A call of a function is replaced by the operations of the function.
+    - So is the solution of a linear system with derivatives of its own.
+    - A call of LAPACK waits for the results of the one before.
+    - So does control flow, as a whole. Inside of it, each call waits for the one before.
+    """
+    # The results of the last call of LAPACK, or of control flow around such calls, so far.
     results_before: Sequence[Any] = ()
 
     def results_of_eqn(eqn: Any, args: list[Any]) -> Sequence[Any]:
@@ -74,20 +81,18 @@ def _run_in_turn(program: Jaxpr | ClosedJaxpr, args: Sequence[Any]) -> list[Any]
         if name in CALLS:
             return results_of_program(eqn.params[CALLS[name]], args, results_of_eqn)
         if name == "custom_linear_solve":
-            # Its arguments are the constants of four functions, and the right-hand side.
-            # The third of these functions, `solve`, is the one that runs.
+            # The arguments are the constants of four functions, `matvec`, `vecmat`, `solve`
+            # and `transpose_solve`, and the right-hand side. Only `solve` runs.
             lengths = eqn.params["const_lengths"]
             begin = lengths.matvec + lengths.vecmat
             constants = args[begin : begin + lengths.solve]
             args = [*constants, *args[sum(lengths) :]]
             return results_of_program(eqn.params["jaxprs"].solve, args, results_of_eqn)
-        # What is left is a call of LAPACK or control flow around such calls. Control flow
-        # as a whole waits for the call before, and the next call waits for it.
         params = eqn.params
         if name in _CONTROL_FLOW:
             params = jtu.tree_map(_with_turns_inside, params, is_leaf=is_program)
-        args = _with_dependence(args, results_before)
-        results_before = results_of_operation(eqn, args, params)
+        waiting_args = _with_dependence(args, results_before)
+        results_before = results_of_operation(eqn, waiting_args, params)
         return results_before
 
     return results_of_program(program, args, results_of_eqn)
@@ -102,14 +107,15 @@ def _calls_lapack(eqn: Any) -> bool:
 
 
 def _with_dependence(args: list[Any], results_before: Sequence[Any]) -> list[Any]:
-    """Arguments of the same values that also depend on all of `results_before`, so that an
-    operation on the arguments waits for these results."""
+    """The arguments, for an operation that is to wait for all of `results_before`.
+
+    Each argument `x` becomes `where(never, 0, x)`. Here `never` is always false, but is
+    computed from an entry of each of the results, so that the operation waits for them.
+    (A barrier around results and arguments would not suffice: XLA removes it before it
+    decides which operations can run side by side.)"""
     if len(results_before) == 0:
         return args
-    # `never` starts as false, so it stays false. A barrier hides this from XLA, so that the
-    # arguments wait for an entry of each result. A barrier around results and arguments
-    # would not suffice: XLA removes it before it decides which operations can run side by
-    # side.
+    # False at the start, `never` stays false. The barrier hides this from XLA.
     never = lax.optimization_barrier(jnp.array(False))
     for x in results_before:
         if _has_numbers(x):
@@ -120,17 +126,16 @@ def _with_dependence(args: list[Any], results_before: Sequence[Any]) -> list[Any
 
 
 def _has_numbers(x: Any) -> bool:
-    """Whether this is an array of numbers, not of random keys, with at least one entry."""
+    """Whether an array has an entry that is a number. Arrays of random keys have none."""
     is_extended = jnp.issubdtype(jnp.result_type(x), jax.dtypes.extended)
     return jnp.size(x) > 0 and not is_extended
 
 
 def _with_turns_inside(param: Any) -> Any:
-    """The parameter of an operation. If it is a program, each call of LAPACK inside of it
-    waits for the call before."""
+    """The parameter of an operation. If it is a program, it becomes one in which each call
+    of LAPACK waits for the call before. The first call in it need not wait, since the
+    operation as a whole waits for the calls before."""
     if not isinstance(param, ClosedJaxpr):
         return param
     structs = [variable.aval for variable in param.jaxpr.invars]
-    # The first call inside of the program need not wait, since the operation as a whole
-    # waits for the calls before.
     return jax.make_jaxpr(lambda *args: _run_in_turn(param, args))(*structs)

@@ -64,7 +64,7 @@ _MOST_REMEMBERED = 128
 # compile anew. Literals of at most this many binary digits stay in the program: numbers
 # such as 2, 1/2 and 12 belong to formulas, and XLA simplifies operations with them.
 _DIGITS_OF_FORMULAS = 2
-# Operations of which a literal as the second argument stays in the program, too: XLA turns
+# In these operations a literal as the second argument stays in the program, too: XLA turns
 # powers with a known exponent into products and roots.
 _KNOWN_SECOND = frozenset(["pow", "rem"])
 # Complex matrices and vectors with axes of up to this length are multiplied entry by entry.
@@ -95,25 +95,28 @@ class Traced(eqx.Module):
 
 
 def traced(fn: Callable, *inputs: PyTree, identity: Any = None) -> Traced:
-    """Traces the function for inputs like these. The leaves of the inputs are arrays, their
-    shapes, or anything else, which becomes part of the program. A `Traced` is returned as
-    it is.
+    """Traces the function for inputs like these. Leaves of the inputs are arrays, instances
+    of `jax.ShapeDtypeStruct` in their place, or anything else, which becomes part of the
+    program. A `Traced` is returned as it is.
+
+    The trace is not kept as it is: products of small complex arrays become sums, and
+    literals that are likely the values of parameters become constants.
 
     A trace names some code without containing it: callbacks, and rules of custom
     derivatives. Programs with such code are the same only for the same `identity`, by
-    default `fn`. Where `fn` is made anew around a function of the user in each call, pass
-    the function of the user."""
+    default `fn`. If `fn` is made anew in each call, around a function of the user, pass the
+    function of the user as `identity`."""
     if isinstance(fn, Traced):
         return fn
     leaves, treedef = jtu.tree_flatten((fn, inputs))
     # Both lists are as long as `leaves`, with `None` for the leaves in the other list.
     array_leaves, other_leaves = eqx.partition(leaves, _is_array_or_struct)
-    # Set by `results` while it is traced.
+    # What `fn` returns beside arrays, which a trace cannot return. Set by `of_arrays`.
     static_results = None
 
     # JAX keeps traces by the identity of functions. This function is new in each call of
     # `traced`, so that it is always traced.
-    def results(arrays: list[Array | None]) -> PyTree:
+    def of_arrays(arrays: list[Array | None]) -> PyTree:
         nonlocal static_results
         all_leaves = eqx.combine(arrays, other_leaves)
         fn_with_arrays, traced_inputs = treedef.unflatten(all_leaves)
@@ -121,7 +124,7 @@ def traced(fn: Callable, *inputs: PyTree, identity: Any = None) -> Traced:
         dynamic_results, static_results = eqx.partition(result, eqx.is_array_like)
         return dynamic_results
 
-    closed_jaxpr, struct = jax.make_jaxpr(results, return_shape=True)(array_leaves)
+    closed_jaxpr, struct = jax.make_jaxpr(of_arrays, return_shape=True)(array_leaves)
     jaxpr = closed_jaxpr.jaxpr
     jaxpr = jaxpr.replace(eqns=[*map(_with_sums_of_products, jaxpr.eqns)])
     jaxpr, literals = _with_literals_as_constants(jaxpr)
@@ -181,6 +184,7 @@ class _Program:
         """The value of the user's function, for the `numbers` of its `Traced`."""
         leaves = jtu.tree_leaves(inputs)
         arrays = [x for x, is_it in zip(leaves, self.is_array, strict=True) if is_it]
+        # The constants of the trace come before the arrays of the function.
         num_consts = len(self.jaxpr.constvars)
         args = [*numbers[num_consts:], *arrays]
         converted = [
@@ -198,8 +202,8 @@ def _with_dtype_of(aval: Any, x: Any) -> Array | np.ndarray:
 
 
 def _with_sums_of_products(eqn: JaxprEqn) -> JaxprEqn:
-    """The operation itself; for a product of small complex arrays, an operation that adds
-    up the products of their entries."""
+    """The operation, or in place of a product of small complex arrays, a call of a function
+    that adds up the products of their entries. `_LONGEST_AXIS` says what that saves."""
     if eqn.primitive.name != "dot_general":
         return eqn
     avals: list[Any] = [x.aval for x in eqn.invars]
@@ -220,7 +224,11 @@ def _with_sums_of_products(eqn: JaxprEqn) -> JaxprEqn:
 def _sums_of_products(
     dimension_numbers: Any, dtype: Any, left: Array, right: Array
 ) -> Array:
-    """The result of `jax.lax.dot_general` in this dtype, as sums of products of entries."""
+    """The result of `jax.lax.dot_general` in this dtype, as sums of products of entries.
+
+    Both factors get the same four groups of axes: those of the batch, those that only the
+    left factor has, those that only the right factor has, and those to be summed. Axes that
+    a factor lacks have length one. Then the factors are multiplied and summed."""
     (left_summed, right_summed), (left_batch, right_batch) = dimension_numbers
     num_batch = len(left_batch)
     num_summed = len(left_summed)
@@ -232,7 +240,6 @@ def _sums_of_products(
 
     left = in_order(left, left_batch, left_summed)
     right = in_order(right, right_batch, right_summed)
-    # The result has the axes of the batch, then the others on the left and on the right.
     end_of_left = left.ndim - num_summed
     num_right = right.ndim - num_batch - num_summed
     left = jnp.expand_dims(left, range(end_of_left, end_of_left + num_right))
@@ -245,24 +252,26 @@ def _with_literals_as_constants(jaxpr: Jaxpr) -> tuple[Jaxpr, list[Array]]:
     """The program with new constants in place of the literals that are likely the values of
     parameters, and the values of these constants."""
     jaxpr = jaxpr.replace(eqns=[*map(_with_inverse_of_divisor, jaxpr.eqns)])
+    # Where the program reads these literals.
     places = [*_parameters_in_operations(jaxpr), *_parameters_in_results(jaxpr)]
     jaxpr, literals = with_constants_at(jaxpr, places)
     return jaxpr, [jnp.asarray(x.val, x.aval.dtype) for x in literals]
 
 
 def _parameters_in_operations(jaxpr: Jaxpr) -> list[OperandPlace]:
-    """Where operations read the values of parameters."""
+    """Where operations read literals that are likely the values of parameters."""
     places = []
-    for k, eqn in enumerate(jaxpr.eqns):
+    for operation, eqn in enumerate(jaxpr.eqns):
         for position, x in enumerate(eqn.invars):
-            stays_known = position == 1 and eqn.primitive.name in _KNOWN_SECOND
-            if _is_parameter(x) and not stays_known:
-                places.append(OperandPlace(k, position))
+            stays_literal = position == 1 and eqn.primitive.name in _KNOWN_SECOND
+            if _is_parameter(x) and not stays_literal:
+                places.append(OperandPlace(operation, position))
     return places
 
 
 def _parameters_in_results(jaxpr: Jaxpr) -> list[OperandPlace]:
-    """Where the program returns values of parameters, such as a constant friction."""
+    """Where the program returns literals that are likely the values of parameters, such as
+    a constant friction."""
     # A literal such as 0.7 may have a weak type: its product with a float32 array has
     # float32. A constant has no weak type: if it has float64, so has the product. Therefore
     # the literal becomes a constant only if all inputs have its dtype.
@@ -275,9 +284,9 @@ def _parameters_in_results(jaxpr: Jaxpr) -> list[OperandPlace]:
 
 
 def _with_inverse_of_divisor(eqn: JaxprEqn) -> JaxprEqn:
-    """The operation itself; for a division by the value of a parameter, the product with
-    its inverse. XLA makes the same of a division by a constant, so that the divisor can be
-    an input at no cost."""
+    """The operation, or in place of a division by the value of a parameter, the product
+    with its inverse. XLA itself does this for a known divisor. So the division costs no
+    more when the divisor becomes an input of the program."""
     if eqn.primitive.name != "div":
         return eqn
     dividend, divisor = eqn.invars
@@ -309,14 +318,14 @@ def _is_parameter(x: Any) -> TypeGuard[Literal]:
     value = np.asarray(x.val)
     if not np.issubdtype(value.dtype, np.floating) or not np.isfinite(value):
         return False
-    # A mantissa of few binary digits becomes a whole number by a product with a small power
-    # of two.
+    # The mantissa is 0.1... in binary digits. If it has no more than `_DIGITS_OF_FORMULAS`
+    # of them, it becomes a whole number when it is scaled by two to this power.
     mantissa, _ = np.frexp(value.astype(float))
     scaled = float(mantissa) * 2**_DIGITS_OF_FORMULAS
     return scaled != round(scaled)
 
 
-# All programs that anything uses, by what they compute.
+# All programs in use, by what they compute.
 _known: weakref.WeakValueDictionary[Hashable, _Program] = weakref.WeakValueDictionary()
 _lock = threading.Lock()
 
@@ -324,6 +333,7 @@ _lock = threading.Lock()
 def _interned(program: _Program, identity: Any) -> _Program:
     """The known program that computes the same as this one. If there is none, this one is
     returned, and known from now on. `identity` is as for `traced`."""
+    # Code that the program names without containing it, added by `_description`.
     only_named: list[Any] = []
     description = (
         _description(program.jaxpr, only_named),
@@ -331,8 +341,8 @@ def _interned(program: _Program, identity: Any) -> _Program:
         program.result_treedef,
         static_part(program.static_results),
     )
-    # Code that is only named cannot be compared. Then only the same function has the same
-    # program.
+    # Code that is only named cannot be compared. If there is any, only the same `identity`
+    # has the same program.
     key = description, static_part(identity) if only_named else None
     with _lock:
         known = _known.setdefault(key, program)
@@ -342,12 +352,13 @@ def _interned(program: _Program, identity: Any) -> _Program:
 
 
 def _description(jaxpr: Jaxpr, only_named: list[Any]) -> Hashable:
-    """All that a program computes. Equal programs have equal descriptions, since variables
-    are numbered in the order in which they appear. Code that the program names without
-    containing it, such as a callback, is appended to `only_named`."""
+    """All that a program computes, as a key: its inputs, operations and outputs. Equal
+    programs have equal descriptions, since variables are numbered in the order in which
+    they appear. Code that the program names without containing it, such as a callback, is
+    appended to `only_named`."""
     number_of: dict[Any, int] = {}
-    # From the identity of a context, the settings for an operation, to its text. The text
-    # is long, and most operations share one context.
+    # The text of each context by its identity. A context holds JAX's settings for an
+    # operation. Its text is long, and most operations share one context.
     contexts: dict[int, str] = {}
 
     def described(x: Any) -> Hashable:
@@ -383,7 +394,8 @@ def _dtype_of(aval: Any) -> str:
 
 
 def _description_of_value(x: Any, only_named: list[Any]) -> Hashable:
-    """The value of a parameter of an operation, as a part of `_description`."""
+    """The value of a parameter of an operation, or a part of one, as a part of
+    `_description`."""
     if is_program(x):
         # Arrays that an inner program closes over are part of the description.
         consts = x.consts if isinstance(x, ClosedJaxpr) else ()
@@ -399,9 +411,9 @@ def _description_of_value(x: Any, only_named: list[Any]) -> Hashable:
     if eqx.is_array(x):
         return _array_value(x)
     if isinstance(x, float | complex):
-        # Zeros of both signs are equal, and NaN is not equal to itself.
+        # As text, since zeros of both signs are equal, and NaN is not equal to itself.
         return type(x), repr(x)
-    # Functions, and values that cannot be compared, count by their type.
+    # Functions, and values without a hash, cannot be compared. They count by their type.
     if is_rule(x) or not _is_hashable(x):
         only_named.append(x)
         return type(x)
@@ -439,8 +451,8 @@ class _ByIdentity:
 
 
 def static_part(tree: PyTree) -> Hashable:
-    """A key for a PyTree without the values of its arrays: the shapes and dtypes of the
-    arrays, and all else."""
+    """A key for a PyTree: its structure, the shapes and dtypes of its arrays, but not their
+    values, and its other leaves."""
     leaves, treedef = jtu.tree_flatten(tree)
     if not _is_hashable(treedef):
         return _ByIdentity(tree)
@@ -448,6 +460,7 @@ def static_part(tree: PyTree) -> Hashable:
 
 
 def _static_leaf(leaf: Any) -> Hashable:
+    """The part of `static_part` for one leaf."""
     if eqx.is_array(leaf):
         # Arrays of NumPy have no weak types.
         return leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)
@@ -459,7 +472,7 @@ def _static_leaf(leaf: Any) -> Hashable:
 
 
 class _Remembered:
-    """A cache. The `max_size` values that were used last are kept."""
+    """A cache, which keeps the `max_size` values that were used last."""
 
     def __init__(self, max_size: int):
         self._max_size = max_size
@@ -489,8 +502,9 @@ _programs = _Remembered(_MOST_PROGRAMS)
 
 
 def compiled(fn: Callable[..., Result], quickly: bool = False) -> Callable[..., Result]:
-    """`equinox.filter_jit(fn)` for functions that return arrays, which drops programs when
-    many others were used since.
+    """The function, compiled, as by `equinox.filter_jit(fn)`, for functions that return
+    arrays. The cache of `filter_jit` keeps all programs. Here only the `_MOST_PROGRAMS`
+    that were used last are kept, for all functions together.
 
     With `quickly`, XLA's older generator of code for CPUs compiles them, where this version
     of XLA has it. The program of a fit takes 2.6 to 5 s of processor time to compile by the
@@ -499,7 +513,6 @@ def compiled(fn: Callable[..., Result], quickly: bool = False) -> Callable[..., 
 
     options = quick_options() if quickly else {}
 
-    # Not by `eqx.filter_jit`, whose cache would keep the programs that are dropped here.
     @ft.wraps(fn)
     def call(*args: Any) -> Result:
         leaves, treedef = jtu.tree_flatten(args)
@@ -509,16 +522,16 @@ def compiled(fn: Callable[..., Result], quickly: bool = False) -> Callable[..., 
         def of_arrays(arrays: list[Array | None]) -> Result:
             return fn(*treedef.unflatten(eqx.combine(arrays, other_leaves)))
 
-        jitted = ft.partial(jax.jit, of_arrays, compiler_options=options)
+        make_jitted = ft.partial(jax.jit, of_arrays, compiler_options=options)
         key = fn, quickly, treedef, static_part(other_leaves)
         try:
-            return _programs.get(key, jitted)(array_leaves)
+            return _programs.get(key, make_jitted)(array_leaves)
         except ValueError as error:
             # JAX refuses options of the compiler for a program inside of another, or one
             # that captures values of another. It has no class of errors for this.
             if "`compiler_options`" not in str(error):
                 raise
-        # The options of the outer program apply.
+        # Inside of another program, the options of the other program apply.
         without_options = compiled(fn)
         return without_options(*args)
 
@@ -546,24 +559,23 @@ def _struct_of_array(x: Any) -> Any:
 
 
 class _NumberedTraces(NamedTuple):
-    """The traces that JAX keeps from contexts of one number.
+    """Traces that JAX keeps, and what shows whether they are still right.
 
-    - `number`: the argument of `with_traces_of`.
-    - `calls`: the calls of the user's functions in these traces, each with the function as
-        it was then.
+    - `number`: the number of the contexts that the traces were made in, for
+        `with_traces_of`. JAX uses a trace again only in a context of the same number.
+    - `calls`: the calls of the user's functions in these traces, each with a trace of the
+        function as it was then.
     """
 
     number: int
     calls: list[tuple[_Call, Traced]]
 
     def are_current(self) -> bool:
-        """Whether the user's functions still compute the same. `False` if there are too
-        many calls to find out."""
+        """Whether the user's functions still compute the same. The answer is `False` if
+        there are too many calls to find out."""
         if len(self.calls) > _MOST_CALLS:
             return False
-        return all(
-            digest(traced(*call)) == digest(program) for call, program in self.calls
-        )
+        return all(digest(traced(*call)) == digest(then) for call, then in self.calls)
 
 
 # For each function that was passed to `current_traces`.
@@ -596,33 +608,36 @@ def current_traces(fn: Callable) -> Iterator[None]:
         _calls.reset(token)
     # Functions in a trace that JAX used again were not called this time. So the calls from
     # earlier contexts are kept.
-    all_calls = [*traces.calls, *_with_functions_of_now(calls.values())]
+    all_calls = [*traces.calls, *_traced_now(calls.values())]
     _numbered_traces.put(key, _NumberedTraces(traces.number, all_calls))
 
 
-def _with_functions_of_now(calls: Iterable[_Call]) -> Iterator[tuple[_Call, Traced]]:
-    """The calls that can be made again later, each with its function as it is now."""
+def _traced_now(calls: Iterable[_Call]) -> Iterator[tuple[_Call, Traced]]:
+    """The calls that can be made again later, each with a trace of its function as it is
+    now.
+
+    The function that `current_traces` is for may make others, from values of its trace.
+    They fail after the trace, or depend on these values. They are left out, since each
+    trace makes others."""
     for call in calls:
-        # A function that `fn` makes from values of its trace cannot be called after the
-        # trace, or returns what depends on these values. It need not be compared, since
-        # each trace makes another one.
         try:
-            program = traced(*call)
+            now = traced(*call)
         except jax.errors.UnexpectedTracerError:
             continue
-        if not any(map(is_traced, program.numbers)):
-            yield call, program
+        if not any(map(is_traced, now.numbers)):
+            yield call, now
 
 
 def once_for_each_signature(fn: Callable[..., Result]) -> Callable[..., Result]:
-    """Decorates a function that reads no values of arrays in its arguments. It is called
-    once for each structure, shapes and dtypes of its arguments, and the result is
-    remembered. To trace anew takes longer than a short ensemble: the checks of shapes took
-    5 of 11 ms for 64 paths."""
+    """Decorates a function whose result does not depend on the values of arrays in its
+    arguments. The function is called once for each structure, shapes and dtypes of the
+    arguments, and its result is remembered. To trace anew takes longer than a short
+    ensemble: the checks of shapes took 5 of 11 ms for 64 paths."""
     remembered = _Remembered(_MOST_REMEMBERED)
 
     @ft.wraps(fn)
     def call_once(*args: Any) -> Result:
+        # The result may depend on the device and on whether numbers have 64 bits.
         settings = jax.default_backend(), jnp.result_type(float)
         return remembered.get((static_part(args), settings), lambda: fn(*args))
 

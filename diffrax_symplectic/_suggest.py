@@ -216,7 +216,8 @@ def suggest_solver(
     """
     if want not in get_args(Want):
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
-    # Any path serves to inspect the terms.
+    # A user may pass the shape of a path in its place. Any path of this shape serves to
+    # inspect the terms. They are inspected without their constraint.
     given_terms = with_paths_for_shapes(terms, WeakBrownianPath)
     terms = without_constraint(given_terms)
     _check_noise(terms)
@@ -231,25 +232,26 @@ def suggest_solver(
     constrained = constraint_of(given_terms) is not None
     system = _inspect(drift, noise, t0, y0, args, constrained)
     paths = brownian_paths(noise)
-    numbers = motion_numbers(random_paths(terms))
+    motions = motion_numbers(random_paths(terms))
     # For each path, whether implicit steps need its increments bounded.
-    needs_truncation = which_need_truncation(terms, t0, y0, args)
+    needs_bounds = which_need_truncation(terms, t0, y0, args)
     suggestions = []
     for solver in _suitable(system, want, paths, one_term=len(noise) == 1):
         assert solver.record is not None
         is_implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-        make_path = ft.partial(own_path, solver, want)
-        which_truncated = tuple(is_implicit and needed for needed in needs_truncation)
-        terms_of_key = ft.partial(
-            _terms_with_paths, make_path, numbers, which_truncated
+        terms_for = ft.partial(
+            _terms_with_paths,
+            make_path=ft.partial(own_path, solver, want),
+            motions=motions,
+            which_truncated=tuple(is_implicit and needed for needed in needs_bounds),
         )
         suggestion = Suggestion(
             solver=solver,
             weak_order=cast(int, solver.record.order("weak", system.commute)),
             strong_order=solver.record.order("strong", system.commute),
-            path=_path_code(solver, want, terms, any(needs_truncation)),
+            path=_path_code(solver, want, terms, any(needs_bounds)),
             reason=solver.record.reason,
-            terms=jtu.Partial(terms_of_key, given_terms),
+            terms=jtu.Partial(terms_for, given_terms),
         )
         suggestions.append(suggestion)
     description = f"For {want} approximation. {system.in_a_sentence()}"
@@ -262,22 +264,28 @@ def suggest_solver(
 
 
 def _terms_with_paths(
-    make_path: Callable,
-    numbers: tuple[int, ...],
-    which_truncated: tuple[bool, ...],
     terms: diffrax.AbstractTerm,
     key: PRNGKeyArray,
+    *,
+    make_path: Callable,
+    motions: tuple[int, ...],
+    which_truncated: tuple[bool, ...],
 ) -> diffrax.AbstractTerm:
-    """The terms with paths that `make_path` makes from this key, of which those with a true
-    flag in `which_truncated` are truncated. `numbers` are the `motion_numbers` of the
-    random paths."""
-    return with_truncation(with_paths(make_path, numbers, terms, key), which_truncated)
+    """The terms with new paths from this key.
+
+    - `make_path(shape, key)`: makes a path.
+    - `motions`: for each random path the number of the Brownian motion that it samples.
+        Paths of the same number get the same key.
+    - `which_truncated`: for each path, whether its increments are truncated.
+    """
+    return with_truncation(with_paths(make_path, motions, terms, key), which_truncated)
 
 
 class System(NamedTuple):
     """What decides which solvers suit a system.
 
-    - `structures`: the structures of the system, beside `"any"`.
+    - `structures`: which of `"separable"`, `"additive"` and `"constant"` the system is: the
+        Hamiltonians are separable, the noise is additive, and constant in time, too.
     - `commute`: whether the noises commute, as far as is known.
     - `num_noises`: the number of scalar Brownian motions.
     - `fault`: why the system is not separable; `None` if it is.
@@ -314,11 +322,14 @@ class System(NamedTuple):
             parts = f"constraints, {parts}"
         fault = self.fault
         reason = "" if fault is None else fault.reason
+        # A system of no structure is not separable, so that it has a reason.
         structure = " and ".join(self.structures) or f"general ({reason})"
         description = f"The system is {structure}, with {parts}."
+        # There is nothing to change in a separable system, or in one for which solvers for
+        # heat baths are suggested.
         if fault is None or self.friction:
             return description
-        # A user who wants a solver that is not suggested can read here why it is not.
+        # Without any structure, the reason is in the description already.
         if self.structures and fault.wrong_way_round:
             description += f" It is not separable: {reason}."
         if fault.friction:
@@ -329,7 +340,8 @@ class System(NamedTuple):
 def _inspect(
     drift: Terms, noise: Terms, t0: Array, y0: Y, args: Args, constrained: bool
 ) -> System:
-    """The system, as it is found by tracing its terms."""
+    """The system, as it is found by tracing its terms. A structure is found if its fault,
+    the reason why the system does not have it, is `None`."""
     fault = separable_fault(drift, noise, t0, y0, args)
     structures: list[Structure] = [] if fault else ["separable"]
     if additive_fault(noise, t0, y0, args) is None:
@@ -338,16 +350,17 @@ def _inspect(
             structures.append("constant")
     terms = diffrax.MultiTerm(*drift, *noise)
     num_noises = number_of_noises(terms)
-    # Noise in the forces commutes, whatever the drift is.
+    # Noise that acts as a force `U_k(t, q)` commutes, whatever the drift is.
     noise_in_forces = separable_fault((), noise, t0, y0, args) is None
-    # `noises_commute` comes last, since it compiles a program, which compares the noises at
-    # random states.
+    # Noises of each of the structures commute. `noises_commute` comes last, since it
+    # compiles a program, which compares the noises at random states.
     commute = (
         num_noises == 1
         or len(structures) > 0
         or noise_in_forces
         or noises_commute(noise, t0, y0, args)
     )
+    # Each friction is one of three kinds, as the fields of `System` say.
     _, friction_terms = friction_apart(drift)
     friction = accepts_friction(terms, t0, y0, args, BAOAB())
     general_bath = (
@@ -374,9 +387,14 @@ def _suitable(
     paths: list[diffrax.AbstractBrownianPath],
     one_term: bool,
 ) -> list[AbstractSymplecticSolver]:
-    """The solvers for a system, best first. `paths` are the paths of its noises, and
-    `one_term` says whether one term holds all noises. Raises a `ValueError` if no solver
-    keeps the constraints of the system."""
+    """The solvers for a system, best first: the ranked ones that
+
+    - keep the constraints of the system, if there are any;
+    - need no Lévy areas between noises that are not entries of one array;
+    - use the random variables of those paths that the suggested terms keep.
+
+    `paths` are the paths of the noises, and `one_term` says whether one term holds all
+    noises. Raises a `ValueError` if no solver keeps the constraints of the system."""
     solvers = ranked(want, system)
     if system.constrained:
         solvers = [solver for solver in solvers if solver.keeps_constraints]
@@ -388,16 +406,15 @@ def _suitable(
                 "noise Hamiltonians H_k = U_k(t, q), and friction only from "
                 "`langevin_terms`."
             )
-    # Lévy areas are sampled only between noises that are entries of one array.
     are_one_array = one_term and jtu.all_leaves([increment_struct(paths[0])])
     if not are_one_array:
         solvers = [
             solver
             for solver in solvers
+            # The random variables that drive brackets of noises are their Lévy areas.
             if "noise brackets" not in map(drives, solver.variables)
         ]
     # Given noise, and paths whose law is not known, are not replaced by paths of a solver.
-    # They must have the random variables of the solver.
     kept = [path for path in paths if not is_random(path) or has_unknown_law(path)]
     return [
         solver
@@ -409,8 +426,9 @@ def _suitable(
 def _has_variables_for(
     path: diffrax.AbstractBrownianPath, solver: AbstractSymplecticSolver
 ) -> bool:
-    """Whether a given path has the random variables that the solver needs."""
-    # `levy_area` is Diffrax's name for the class of the increments of a path.
+    """Whether a path has the random variables that the solver needs. Every path has `"W"`,
+    the increments alone."""
+    # `levy_area` is Diffrax's name for the class of what a path returns for a step.
     increment = getattr(path, "levy_area", diffrax.AbstractBrownianIncrement)
     return solver.variables == ("W",) or issubclass(increment, solver.minimal_levy_area)
 
@@ -454,7 +472,8 @@ def ranked(want: Want, system: System) -> list[AbstractSymplecticSolver]:
 
 
 def _ranked_for_means(system: System) -> list[type[AbstractSymplecticSolver]]:
-    """The solvers for means, best first for such a system. Not all of them suit it."""
+    """All classes of solvers for means, those that are best for such a system first. Not
+    all of them suit the system."""
     first: list[type[AbstractSymplecticSolver]] = [*FOR_FRICTION]
     last: list[type[AbstractSymplecticSolver]] = []
     if system.friction or system.friction_in_drift:
@@ -467,7 +486,8 @@ def _ranked_for_means(system: System) -> list[type[AbstractSymplecticSolver]]:
 
 
 def _suits(kind: type[AbstractSymplecticSolver], system: System) -> bool:
-    """Whether solvers of this class are for such a system."""
+    """Whether solvers of this class are for such a system. Those for heat baths are if they
+    treat its friction, all others if they are for its structure and its noises."""
     if kind in FOR_FRICTION:
         return system.friction
     structures = {"any", *system.structures}
@@ -480,8 +500,8 @@ def _suits(kind: type[AbstractSymplecticSolver], system: System) -> bool:
 
 
 def _code(solver: AbstractSymplecticSolver, module: str = "") -> str:
-    """The code that constructs the solver, such as `BAOAB(ImplicitMidpoint())`. Names have
-    the prefix `module`."""
+    """The code that constructs the solver, such as `BAOAB(ImplicitMidpoint())`. Each name
+    gets the prefix `module`, such as `ds.`."""
     flow = ""
     if isinstance(solver, BAOAB) and is_solver(solver.flow):
         flow = _code(solver.flow, module)  # pyright: ignore
@@ -494,16 +514,19 @@ def _path_code(
     terms: diffrax.AbstractTerm,
     needs_bounded: bool,
 ) -> str:
-    """Describes the path of a suggestion: by the code that makes it, or in words if the
-    path of the terms is kept. If several paths are made, which differ only in their shapes,
-    the code makes the first. `needs_bounded` says whether a path needs bounded
-    increments."""
+    """Describes the path of a suggestion.
+
+    - If the solver makes new paths: the code that makes the first of them. They differ only
+        in their shapes.
+    - If random paths of an unknown law are kept, or given noise: in words.
+
+    `needs_bounded` says whether implicit steps need bounded increments of any path."""
     random_noise = random_paths(terms)
     replaceable = [path for path in random_noise if not has_unknown_law(path)]
     if replaceable:
         struct = increment_struct(replaceable[0])
         shape = _shape_code(struct)
-        # `solver.path` does not know the terms, and truncates increments in case they must
+        # `solver.path` does not know the terms. It truncates increments in case they must
         # be bounded. If they need not be, the code makes the same path without truncation.
         example = solver.path(struct, jr.key(0), want=want)
         if isinstance(example, TruncatedBrownianPath) and not needs_bounded:
@@ -515,8 +538,8 @@ def _path_code(
 
 
 def _shape_code(shape: PyTree[jax.ShapeDtypeStruct]) -> str:
-    """The code for the shape of a path, such as `(3,)`."""
-    # The code for a PyTree of shapes would be long, so that a name stands for it.
+    """The code for the shape of a path, such as `(3,)`. The code for a PyTree of shapes
+    would be long, so that the name `shape` stands for it."""
     if not isinstance(shape, jax.ShapeDtypeStruct):
         return "shape"
     if shape.dtype == jnp.result_type(float):

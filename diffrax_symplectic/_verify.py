@@ -37,9 +37,10 @@ from ._terms import (
 
 
 def _one_step(terms, solver, t0, t1, y0, args) -> tuple[Y, diffrax.RESULTS]:
-    """The end of one step, and whether it succeeded."""
-    # Before `with_programs`, since programs do not tell which functions they come from.
+    """The state at the end of one step, and whether the step succeeded."""
     check_drifts_differ(terms)
+    # From here on, the functions of the user are replaced by their traces, which do not
+    # tell which functions they come from.
     terms = with_programs(terms, t0, y0, args)
     solver = with_programs(solver, t0, y0, args)
     # `diffrax.diffeqsolve` is not used: its loop takes longer to trace than the step.
@@ -113,7 +114,8 @@ def symplecticity_defect(
 def _allowed_directions(terms, t0, y0: Y, args: Args) -> Float[Array, "n k"]:
     """An orthonormal basis of the directions along which an allowed state can move, in
     columns. A state is allowed if constraint(q) = 0 and J v = 0, with the Jacobian J of the
-    constraint and the velocities v."""
+    constraint and the velocities v. The allowed directions are orthogonal to the gradients
+    of both equations."""
     surface = Surface.of(with_programs(terms, t0, y0, args), t0, y0, args)
     flat, _ = jfu.ravel_pytree(y0)
 
@@ -123,9 +125,9 @@ def _allowed_directions(terms, t0, y0: Y, args: Args) -> Float[Array, "n k"]:
         residual, J_v = jax.jvp(surface.residual, (q,), (surface.velocity(p),))
         return jnp.concatenate([residual, J_v])
 
-    # The allowed directions are orthogonal to the gradients of the equations. The rows of
-    # V^T are orthonormal. The first ones, as many as there are equations, span the
-    # gradients. The others span the allowed directions.
+    # A singular value decomposition of the gradients, one in each row. The rows of V^T are
+    # orthonormal. The first ones, as many as there are equations, span the gradients. The
+    # others span the allowed directions.
     gradients = jax.jacrev(equations)(flat)
     _, _, V_transposed = jnp.linalg.svd(gradients, full_matrices=True)
     return V_transposed[len(gradients) :].T
@@ -165,7 +167,7 @@ def poisson_defect(
     s0 = from_spinors(y0) if are_spinors else as_spins(y0)
 
     def step(s: Array) -> tuple[Array, tuple[Array, diffrax.RESULTS]]:
-        # Any spinors of a spin will do, since all of them move to those of the same spin.
+        # A spin has many spinors. Any will do, since all move to spinors of the same spin.
         y0 = to_spinors(s) if are_spinors else s
         y1, result = _one_step(terms, solver, t0, t1, y0, args)
         s1 = from_spinors(y1) if are_spinors else y1
@@ -173,18 +175,19 @@ def poisson_defect(
 
     jacobian, (s1, result) = jax.jacrev(step, has_aux=True)(s0)
     jacobian = result.error_if(jacobian, result != diffrax.RESULTS.successful)
-    # (n, *s0.shape) for n components: row i of `gradients` is ds1_i / ds0, and row i of
-    # `unit_vectors` the gradient of s_i itself.
+    # A row for each of the n components of all spins, with the shape of `s0`: row i of
+    # `gradients` is ds1_i / ds0, and row i of `unit_vectors` is the unit vector i.
     num_components = s0.size
     gradients = jacobian.reshape(num_components, *s0.shape)
     identity = jnp.eye(num_components, dtype=s0.dtype)
     unit_vectors = identity.reshape(num_components, *s0.shape)
 
     def as_matrix(rows: Array) -> Array:
+        """The (n, n) matrix of these rows."""
         return rows.reshape(num_components, num_components)
 
     # P(s) is never formed. Since P(s) v = s x v, the cross products of s with the rows of a
-    # matrix M are the columns of P(s) M^T, here for M = J and for the identity M.
+    # matrix M are the columns of P(s) M^T. M is J, and then the identity.
     J = as_matrix(gradients)
     P_Jt = as_matrix(jnp.cross(s0, gradients)).T
     J_P_Jt = dot(J, P_Jt)
@@ -244,7 +247,7 @@ def equipartition(
     def phi(t: RealScalarLike, y: Y, args: Args) -> dict[str, Array]:
         check_pair(y)
         p, q = y
-        # (-dH0/dq, dH0/dp)
+        # dp/dt = -dH0/dq and dq/dt = dH0/dp, without friction and noise.
         force, velocity = rate(with_programs(drift, t, y, args), t, y, args)
         n = sum(leaf.size for leaf in jtu.tree_leaves(q))
         return {
@@ -334,13 +337,14 @@ def second_moment_map(
     check_unconstrained(terms, "second_moment_map")
     flat, unravel = jfu.ravel_pytree(y0)
     size = flat.size
-    # The step is affine, so its values at zero and at the unit vectors give its matrix.
-    # Differentiating it would take far more tracing. Row 0 of `starts` is zero, the others
-    # are the unit vectors.
+    # The step is affine, y1 = A y0 + b, so its values at zero and at the unit vectors give
+    # A and b. Differentiating it would take far more tracing. Row 0 of `starts` is zero,
+    # the others are the unit vectors.
     starts = jnp.eye(size + 1, size, k=-1, dtype=flat.dtype)
 
     def kron_Z_Z(terms_of_step: PyTree) -> tuple[Array, diffrax.RESULTS]:
-        """The Kronecker product of Z with itself, for one outcome of the variables."""
+        """The Kronecker product of Z with itself, for the terms with given increments, and
+        the result of the step."""
 
         def step(y: Array) -> tuple[Array, diffrax.RESULTS]:
             y1, result = _one_step(terms_of_step, solver, t0, t1, unravel(y), args)
@@ -348,8 +352,8 @@ def second_moment_map(
             return end, result
 
         ends, result = jax.vmap(step)(starts)
-        # Row 0 of Z keeps the constant 1 of z. Column 0 is the end from zero; each other
-        # column is what a unit vector adds to that end.
+        # For z = (1, y), Z has the rows (1, 0) and (b, A). Here b is the end from zero, and
+        # each column of A is what a unit vector adds to this end.
         row_of_one = jnp.zeros_like(flat, shape=(1, size + 1)).at[0, 0].set(1)
         columns = ends.at[1:].add(-ends[0])
         Z = jnp.concatenate([row_of_one, columns.T])
@@ -368,13 +372,16 @@ def _mean_over_step(
     `value_of` gets the terms with one outcome of these variables, and returns the value and
     the result of the step. `nodes` is as for `step_expectation`."""
     check_baths_have_own_noise(terms)
+    # The probability law of each variable, and a function that returns the terms with given
+    # values of the variables in place of the paths.
     laws, terms_with = step_variables(terms, h)
+    # Each row has the values of all variables. Its weight is the probability of the values.
     rows, weights = outcomes(laws, nodes)
 
     def value_for(row: Array) -> tuple[PyTree[Array], diffrax.RESULTS]:
         return value_of(terms_with(row))
 
-    # Each row is an outcome of all variables. The step is traced once for all of them.
+    # The step is traced once for all rows.
     values, result = jax.vmap(value_for)(rows)  # pyright: ignore
     values = result.error_if(values, result != diffrax.RESULTS.successful)
 
@@ -430,20 +437,21 @@ def weak_order_defect(
     # Time has the dtype of the state, so that vector fields have it, too.
     t = jnp.asarray(t0, jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).dtype)
     defect = mean
-    # In round j this is L^j phi, as a function of time and state, and h^j / j!.
-    power_of_generator = phi
+    # In round j these are the function L^j phi of time and state, and h^j / j!.
+    L_power_phi = phi
     coefficient = 1.0
     for j in range(order + 1):
-        value = power_of_generator(t, y0)
+        value = L_power_phi(t, y0)
         defect = (defect**ω - coefficient * value**ω).ω
-        power_of_generator = generator(power_of_generator)
+        L_power_phi = generator(L_power_phi)
         coefficient = coefficient * (t1 - t0) / (j + 1)
     return defect
 
 
 def _generator(terms, args, ito: bool) -> Callable:
-    r"""The generator $L$ of the equation, as a map from functions $\phi(t, y)$ to functions
-    $L \phi (t, y)$, whose values are PyTrees like those of $\phi$:
+    r"""The generator $L$ of the equation with the drift $a$ and the noises $b_k$, as a map
+    from functions $\phi(t, y)$ to functions $L \phi (t, y)$, whose values are PyTrees like
+    those of $\phi$:
 
     $$L \phi = \partial_t \phi + a \cdot \nabla \phi
       + \tfrac12 \sum_k (b_k \cdot \nabla)^2 \phi,$$
@@ -461,9 +469,9 @@ def _generator(terms, args, ito: bool) -> Callable:
     def generator(phi: Callable) -> Callable:
         def L_phi(t: RealScalarLike, y: Y) -> PyTree[Array]:
             zero = jtu.tree_map(jnp.zeros_like, y)
-            velocity = rate(drift, t, y, args) if drift else zero
+            a = rate(drift, t, y, args) if drift else zero
             # The derivatives by time and along the drift are one derivative, along (1, a).
-            _, total = jax.jvp(phi, (t, y), (jnp.ones_like(t), velocity))
+            _, total = jax.jvp(phi, (t, y), (jnp.ones_like(t), a))
             for field in fields:
                 second = _second_derivative(phi, field, t, y, ito)
                 total = (total**ω + second**ω / 2).ω
@@ -483,6 +491,8 @@ def _second_derivative(
     field_at_y = field(t, y)
 
     def first_derivative(y: Y) -> PyTree[Array]:
+        """The derivative of `phi` at any state, along the field there, or for an Itô
+        equation along the line."""
         direction = field_at_y if ito else field(t, y)
         _, derivative = jax.jvp(lambda y: phi(t, y), (y,), (direction,))
         return derivative
