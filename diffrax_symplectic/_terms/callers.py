@@ -57,16 +57,22 @@ def with_programs(terms: _T, t: RealScalarLike, y: Y, args: Args) -> _T:
     Functions that compute the same have equal programs. So what JAX has compiled for the
     returned terms also serves for other functions that compute the same.
 
+    The terms are taken apart into parts, the objects that call functions of the user. The
+    functions in the fields of a part are replaced. A term of a class of the user's, whose
+    fields are not known, is replaced as a whole.
+
     Raises what the functions raise for a state like `y`. Also raises a `ValueError` if the
     terms are those of a Hamiltonian system, and `y` is not a pair `(p, q)`."""
     y = jtu.tree_map(jnp.asarray, y)
     t = jnp.asarray(t, jnp.result_type(*jtu.tree_leaves(y)))
-    # What takes the place of each function, or term of the user's class, by its `id`. A
-    # function that several parts hold, such as the energy of a heat bath, is traced once.
+    # What takes the place of each function, or term of the user's class, by the `id` of the
+    # function or term. A function that several parts hold, such as the energy of a heat
+    # bath, is traced once.
     programs: dict[int, Any] = {}
     for part in _parts(terms):
         if isinstance(part, AbstractCaller):
             check_pair(y)
+        # A term of a class of the user's: its methods become programs.
         is_term = isinstance(part, diffrax.AbstractTerm)
         if is_term and not isinstance(part, _KNOWN_TERMS):
             control = eqx.filter_eval_shape(part.contr, t, t)
@@ -75,13 +81,16 @@ def with_programs(terms: _T, t: RealScalarLike, y: Y, args: Args) -> _T:
                 field=_traced_field(part.vf, t, y, args, identity=part),
                 product=traced(part.vf_prod, t, y, args, control, identity=part),
             )
+        # Any other part: the functions in its fields become programs. The value of a vector
+        # field of a `ControlTerm` may be a Lineax operator, which takes another tracer.
         trace = _traced_field if isinstance(part, diffrax.ControlTerm) else traced
         for name, inputs in _inputs_of_functions(part, t, y, args).items():
             fn = getattr(part, name)
             # The field may hold a constant, such as a friction, or an inner part.
             is_function = callable(fn) and not isinstance(fn, _PARTS)
             if is_function and id(fn) not in programs:
-                # Errors while the function is traced come with advice.
+                # `_call` adds advice to errors of the function while it is traced. The
+                # program still belongs to the function itself, its `identity`.
                 call = jtu.Partial(_call, name, fn)
                 programs[id(fn)] = trace(call, *inputs, identity=fn)
 
@@ -92,7 +101,7 @@ def with_programs(terms: _T, t: RealScalarLike, y: Y, args: Args) -> _T:
 
 
 def _parts(tree: PyTree) -> Iterator[Any]:
-    """All parts of terms or of a solver, also those within other parts."""
+    """All parts of terms or of a solver, each before the parts within it."""
 
     def is_inner_part(x: Any) -> bool:
         return x is not tree and isinstance(x, _PARTS)
@@ -130,7 +139,9 @@ def _call(name: str, fn: Callable, *inputs: Any) -> PyTree[Array]:
 def _traced_field(
     fn: Callable, t: RealScalarLike, y: Y, args: Args, identity: Any
 ) -> Callable:
-    """The program of a vector field, whose value may be a Lineax operator."""
+    """The program of a vector field, whose value may be a Lineax operator. `identity` is
+    that of `traced`."""
+    # The shapes of the value.
     field = eqx.filter_eval_shape(fn, t, y, args)
     if not isinstance(field, lx.AbstractLinearOperator):
         return traced(fn, t, y, args, identity=identity)

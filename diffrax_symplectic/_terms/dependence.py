@@ -25,7 +25,8 @@ class Dependence:
         self._inputs = inputs
 
     def independent(self, of: Callable, part: Callable = lambda out: out) -> bool:
-        """Whether the arrays `part(result)` are independent of the arrays `of(*inputs)`."""
+        """Whether the arrays `part(result)` are independent of the arrays `of(*inputs)`,
+        where `result` is `fn(*inputs)`."""
         is_in_part = _which_are_selected(part, self._out)
         # The program for these results alone may read fewer inputs than the whole one.
         _, is_read = dce_jaxpr(self._jaxpr, is_in_part)
@@ -54,7 +55,8 @@ def _without_powers_of_zero(jaxpr: Jaxpr) -> Jaxpr:
 
 def _which_are_selected(select: Callable, tree: PyTree) -> list[bool]:
     """For each leaf of `tree`, in order, whether it is a leaf of `select(tree)`."""
-    # Leaves may be equal, or have no values, so they are told apart by their numbers.
+    # Leaves may be equal, or have no values. So `select` gets a tree in which each leaf is
+    # replaced by its number.
     treedef = jtu.tree_structure(tree)
     tree_of_numbers = treedef.unflatten(range(treedef.num_leaves))
     selected_numbers = set(jtu.tree_leaves(select(tree_of_numbers)))
@@ -73,7 +75,8 @@ _CALLS = frozenset({"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp
 
 class _Source:
     """Stands for an input, as the source of the values that depend on it entry by entry.
-    Any other object in the place of a source stands for no input."""
+    Values that depend on no input have any other object in the place of a source: `None`,
+    or the value itself if it is a constant of the program."""
 
 
 class _MixesEntries(Exception):
@@ -83,7 +86,11 @@ class _MixesEntries(Exception):
 def acts_elementwise(fn: Callable, x: PyTree[Array]) -> bool:
     """Whether each entry of `fn(x)`, in the structure of `x`, is known to depend only on
     the same entry of `x`, so that the derivative is diagonal. If false, it may be so all
-    the same."""
+    the same.
+
+    Each array in `x` gets a token, a `_Source`. The tokens are followed through the program
+    of `fn`, as long as operations act entry by entry. The result is true if each array in
+    `fn(x)` ends up with the token of its own array in `x`, or with none."""
     closed = jax.make_jaxpr(fn)(x)
     inputs = [_Source() for _ in closed.jaxpr.invars]
     try:
@@ -114,7 +121,8 @@ def _sources_of_results(program: Any, sources: Sequence[Any]) -> list[Any]:
 
 
 def _sources_of_operation(eqn: Any, sources: list[Any]) -> list[Any]:
-    """The source of each result of one operation, as `_sources_of_results` has it."""
+    """The source of each result of one operation, for the `sources` of its arguments.
+    Raises `_MixesEntries` if the operation may mix entries or inputs."""
     distinct = {source for source in sources if isinstance(source, _Source)}
     if len(distinct) == 0:
         return [None for _ in eqn.outvars]
@@ -128,14 +136,16 @@ def _sources_of_operation(eqn: Any, sources: list[Any]) -> list[Any]:
 
 
 def _is_elementwise(eqn: Any, sources: list[Any]) -> bool:
-    """Whether an operation acts entry by entry on those arguments that have a source."""
+    """Whether an operation is known to act entry by entry on those arguments that have a
+    source. Each of them then has the shape of the result."""
     shape = eqn.outvars[0].aval.shape
     pairs = zip(eqn.invars, sources)
     tracked = [x for x, source in pairs if isinstance(source, _Source)]
     if any(x.aval.shape != shape for x in tracked):
         return False
     if eqn.primitive.name == "dot_general":
-        # A product with a single number, as in the derivative of `p @ p`, sums no entries.
+        # A product with an array of one number, as in the derivative of `p @ p`, sums no
+        # entries.
         return len(tracked) == 1 and any(x.aval.size == 1 for x in eqn.invars)
     # These two act entry by entry if they keep the shape, as they do here.
     if eqn.primitive.name in ("reshape", "broadcast_in_dim"):

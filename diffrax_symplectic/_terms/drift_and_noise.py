@@ -29,8 +29,12 @@ _BACKSOLVE = (
 def split_terms(terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
     """The drift terms and the noise terms.
 
-    A term is noise if it has a Brownian path. A term without one is a drift if it is the
-    first term or an `ODETerm`, constrained or not, and otherwise noise.
+    - A term with a Brownian path is noise.
+    - An `ODETerm`, constrained or not, is a drift.
+    - A term of any other class, such as one of the user's, is a drift if it is the first
+        term, as in Diffrax's `MultiTerm(drift, diffusion)`. Otherwise it is noise: it may
+        be driven by a path that is not a Brownian path of Diffrax. It must not pass for a
+        drift, since most solvers treat noise differently.
 
     Raises a `ValueError` for the terms of `diffrax.BacksolveAdjoint`."""
     parts = flattened(terms)
@@ -38,14 +42,13 @@ def split_terms(terms: diffrax.AbstractTerm) -> tuple[Terms, Terms]:
         raise ValueError(_BACKSOLVE)
     drift = []
     noise = []
-    for place, term in enumerate(parts):
-        # A term of the user's own class may be driven by a path that is not a Brownian path
-        # of Diffrax. It must not pass for a drift: most solvers treat noise differently.
+    for i, term in enumerate(parts):
+        has_path = len(brownian_paths(term)) > 0
         is_ode = isinstance(unwrapped(term), diffrax.ODETerm | ConstrainedDrift)
-        if len(brownian_paths(term)) > 0 or (place > 0 and not is_ode):
-            noise.append(term)
-        else:
+        if not has_path and (is_ode or i == 0):
             drift.append(term)
+        else:
+            noise.append(term)
     return tuple(drift), tuple(noise)
 
 
@@ -77,8 +80,9 @@ def split_friction(terms: PyTree[diffrax.AbstractTerm]) -> tuple[Terms, Terms, T
 def friction_apart(drift: Terms) -> tuple[Terms, Terms]:
     """The terms of the drift without friction, and the terms of the friction.
 
-    A term of `drift` may be a drift with friction, as from `langevin_terms`, which becomes
-    two terms; friction alone, as from `bath_terms`; or a drift without friction."""
+    - A drift with friction, as from `langevin_terms`, becomes two terms, one of each.
+    - Friction alone, as from `bath_terms`, and a drift without friction stay as they are.
+    """
     rest = []
     friction = []
     for term in drift:
@@ -95,13 +99,15 @@ def friction_apart(drift: Terms) -> tuple[Terms, Terms]:
 
 
 def slow_apart(drift: Terms) -> tuple[Terms, Terms]:
-    """The terms of the drift without the slow potentials, and the terms of the slow
-    potentials. The drift must have no friction."""
+    """The terms of the drift without slow potentials, and the terms of the slow potentials,
+    which are those that users pass as `slow`. The drift must have no friction, which would
+    be in both."""
     rest = []
     slow = []
     for term in drift:
         field = field_of(term)
         if isinstance(field, Drift) and field.slow is not None:
+            # The energy is `H0 + slow`. Each of the two terms keeps one summand.
             rest.append(_with_field(term, dataclasses.replace(field, slow=None)))
             slow.append(_with_field(term, dataclasses.replace(field, H0=None)))
         else:
@@ -112,7 +118,8 @@ def slow_apart(drift: Terms) -> tuple[Terms, Terms]:
 def control_struct(
     term: diffrax.AbstractTerm, t: RealScalarLike = 0.0
 ) -> PyTree[jax.ShapeDtypeStruct]:
-    """The shapes and dtypes of the control of a term, for times with the dtype of `t`."""
+    """The shapes and dtypes of the control of a term, which is the length of a step or the
+    increments of a path, for times with the dtype of `t`."""
     return eqx.filter_eval_shape(term.contr, t, t + 1)
 
 

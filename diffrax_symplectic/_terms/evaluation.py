@@ -31,6 +31,7 @@ def call_user_function(
     # The function gets a copy of the containers in `args`. If it modifies them in place,
     # the next trace still gets the original `args`.
     copy = jtu.tree_map(lambda leaf: leaf, args)
+    # Inside of `current_traces` this records that a trace depends on the function.
     note_call(function, *inputs, copy)
     try:
         return function(*inputs, copy)
@@ -41,6 +42,7 @@ def call_user_function(
             "or `jax.lax.cond` instead of `if`, and `jnp` instead of `np`."
         ) from error
     except (TypeError, AttributeError) as error:
+        # Notes say what in `args` may be the cause.
         # Errors of Python and JAX about `None` name its type.
         if args is None and "NoneType" in str(error):
             error.add_note(f"`{name}` was called with `args=None`. Was it left out?")

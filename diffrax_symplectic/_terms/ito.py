@@ -69,7 +69,8 @@ def ito_drift(*noise: diffrax.AbstractTerm) -> diffrax.ODETerm:
 
 
 class _ItoDrift(eqx.Module):
-    """The vector field of `ito_drift`.
+    """The vector field `-1/2 sum_k b_k' b_k` of `ito_drift`, where `b_k'` is the derivative
+    of the noise `b_k` by the state.
 
     - `leaves`, `structure`: the noise terms, flattened. Functions that look for noise or
         Hamiltonians in a PyTree of terms would find whole noise terms within this drift.
@@ -86,10 +87,11 @@ class _ItoDrift(eqx.Module):
         zeros, unravel = zeros_and_unravel(dict(zip(self.motions, structs)))
 
         def derivative_along_itself(unit: Float[Array, " n"]) -> Y:
-            """`b_k' b_k`, for the noise `k` whose increment is one. `unit` holds the
-            increments of all Brownian motions, flattened; the others are zero."""
+            """`b_k' b_k` for one noise `k`. `unit` holds the increments of all Brownian
+            motions, flattened: one for this noise, and zero for all others."""
             increments = unravel(unit)
             controls = [increments[motion] for motion in self.motions]
+            # `b_k` as a function of the state.
             field = ft.partial(apply, noise, controls, args, t)
             _, change = jax.jvp(field, (y,), (field(y),))
             return change

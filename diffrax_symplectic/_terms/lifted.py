@@ -1,5 +1,5 @@
 """Hamiltonians of another variable than `(p, q)`, such as spins or complex amplitudes, and
-the damping of these. The variable is a function of `(p, q)`, here called its chart."""
+the damping of these. The variable is a function of `(p, q)`, here called the chart."""
 
 from collections.abc import Callable
 from typing import Any
@@ -37,8 +37,7 @@ class Lifted(AbstractCaller):
         return {"H": (index, *inputs) if self.is_indexed else inputs}
 
     def __call__(self, *inputs) -> PyTree[Array]:
-        # The inputs before `p` are the time, or for an `IndexedNoise` the index and the
-        # time.
+        # `(t, p, q, args)`, or for an `IndexedNoise` `(k, t, p, q, args)`.
         *index_and_time, p, q, args = inputs
         return self.H(*index_and_time, self.chart((p, q)), args)
 
@@ -56,9 +55,9 @@ def lifted_terms(
     variable_name: str,
     damped_drift: Callable | None,
 ) -> diffrax.MultiTerm:
-    """The terms of Hamiltonians in the variable `chart((p, q))`. Messages call the variable
-    `variable_name`. If there is a vector field `damped_drift`, it takes the place of the
-    vector field of `H0`."""
+    """The terms of Hamiltonians in the variable `chart((p, q))`, which messages call
+    `variable_name`. With damping, `damped_drift` is the vector field of `(p, q)` that
+    takes the place of the vector field of `H0`; without damping it is `None`."""
     check_takes("H0", H0, "t", variable_name, "args")
     if noise is None:
         if path is not None:
@@ -77,6 +76,7 @@ def lifted_terms(
     terms = hamiltonian_terms(Lifted(H0, chart), lifted_noise, path)
     if damped_drift is None:
         return terms
+    # The first term is the drift, and after it comes the noise, if there is any.
     return diffrax.MultiTerm(diffrax.ODETerm(damped_drift), *terms.terms[1:])
 
 

@@ -104,8 +104,9 @@ def motion_numbers(paths: Sequence[diffrax.AbstractBrownianPath]) -> tuple[int, 
     numbers: list[int] = []
     for path in paths:
         # `zip` ends with `numbers`, so it pairs only the earlier paths with their numbers.
-        matches = (n for n, other in zip(numbers, paths) if _are_equal(path, other))
-        numbers.append(next(matches, max(numbers, default=-1) + 1))
+        earlier = (n for n, other in zip(numbers, paths) if _are_equal(path, other))
+        next_free_number = len(set(numbers))
+        numbers.append(next(earlier, next_free_number))
     return tuple(numbers)
 
 
@@ -129,8 +130,8 @@ def replace_paths(terms: PyTree, new_path: Callable) -> PyTree:
 
 
 def with_paths_for_shapes(terms: PyTree, make_path: Callable) -> PyTree:
-    """The terms with `make_path(shape, key)` in place of each shape of a path. The keys
-    differ, since each shape is a Brownian motion of its own."""
+    """The terms with `make_path(shape, key)` in place of each shape that stands for a path.
+    The keys differ, since each shape is a Brownian motion of its own."""
     terms = shapes_as_paths(terms)
     has_only_shapes = all(which_are_shapes(terms))
     seeds = itertools.count(0 if has_only_shapes else _SEED_BESIDE_OTHERS)
@@ -146,11 +147,14 @@ def with_paths_for_shapes(terms: PyTree, make_path: Callable) -> PyTree:
 def with_paths(
     make_path: Callable, numbers: tuple[int, ...], terms: PyTree, key: PRNGKeyArray
 ) -> PyTree:
-    """The terms with `make_path(shape, key)` in place of each random path, or with a new
-    key in the path if its law is unknown.
+    """The terms with new noise, derived from `key`, in each random path: one that draws its
+    noise from a random key.
+
+    - A path whose law is known, or a shape, becomes `make_path(shape, new_key)`.
+    - A path whose law is unknown gets keys derived from `new_key` in place of its own.
 
     `numbers` are the `motion_numbers` of the random paths. Paths with the same number get
-    the same key, derived from `key`."""
+    the same new key."""
     remaining_numbers = iter(numbers)
 
     def new_path(path: diffrax.AbstractBrownianPath) -> diffrax.AbstractBrownianPath:
@@ -179,7 +183,8 @@ def path_keys(terms: PyTree[diffrax.AbstractTerm], key: PRNGKeyArray) -> list[Ar
 
 
 def with_keys(terms: PyTree[diffrax.AbstractTerm], keys: list[Array]) -> PyTree:
-    """The terms with the `keys`, from `path_keys(terms, key)`, in their paths."""
+    """The terms with `keys` in place of the random keys in their paths, in order. `keys`
+    are those of `path_keys(terms, key)`."""
     remaining_keys = iter(keys)
 
     def with_next_keys(path: diffrax.AbstractBrownianPath) -> PyTree:

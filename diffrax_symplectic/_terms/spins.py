@@ -104,15 +104,17 @@ class _DampedPrecession(AbstractCaller):
 
         gradient = jax.grad(energy)(s)
         alpha = damping_for(_EACH, self.alpha, s.shape[:-1], s.dtype)
-        # `omega`. Without damping it is the gradient. Damping adds a cross product, which
-        # lets the spin spiral to lower energy.
+        # `w` is `omega = gradient + alpha s x gradient`. The cross product lets the spin
+        # spiral to lower energy.
         s1, s2, s3 = _components(s)
         g1, g2, g3 = _components(gradient)
         w1 = g1 + alpha * (s2 * g3 - s3 * g2)
         w2 = g2 + alpha * (s3 * g1 - s1 * g3)
         w3 = g3 + alpha * (s1 * g2 - s2 * g1)
-        # The symplectic gradient of `omega . s(p, q)`, with `omega` fixed, by hand: by
-        # `jax.grad` it takes 1.3 times as long.
+        # The symplectic gradient of `w . s(p, q)` with `w` fixed. By `from_spinors` this is
+        # half of
+        #     w1 (q1 q2 + p1 p2) + w2 (p1 q2 - q1 p2) + w3 (q1^2 + p1^2 - q2^2 - p2^2) / 2.
+        # It is written out, since by `jax.grad` it takes 1.3 times as long.
         p, q = y
         p1, p2 = _components(p)
         q1, q2 = _components(q)
@@ -158,7 +160,8 @@ def from_spinors(y: _Spinors) -> _Spins:
         )
     p1, p2 = _components(p)
     q1, q2 = _components(q)
-    # a b* = (q1 q2 + p1 p2) + i (p1 q2 - q1 p2), and twice a quarter is a half.
+    # The components are 2 / 4 = 1 / 2 of the real and imaginary part of
+    # a b* = (q1 q2 + p1 p2) + i (p1 q2 - q1 p2), and (|a|^2 - |b|^2) / 4.
     s1 = (q1 * q2 + p1 * p2) / 2
     s2 = (p1 * q2 - q1 * p2) / 2
     s3 = (q1**2 + p1**2 - q2**2 - p2**2) / 4
@@ -169,10 +172,12 @@ def to_spinors(s: _Spins) -> _Spinors:
     r"""A state $(p, q)$ for the vectors $s$: the initial state of a solve of
     [`diffrax_symplectic.spin_terms`][]. `from_spinors(to_spinors(s))` is $s$.
 
-    The states $(\mathrm e^{\mathrm i \phi} a, \mathrm e^{\mathrm i \phi} b)$ give the same
-    $s$ for every phase $\phi$, at all times. No choice of the phase is continuous on the
-    whole sphere. Here $a > 0$ if $s_3 \ge 0$ and $b > 0$ if $s_3 < 0$, so $(p, q)$ jumps
-    where $s$ crosses the equator. Derivatives of functions of $s$ are correct everywhere.
+    Each spin becomes two complex numbers $a = q_1 + \mathrm i p_1$ and $b = q_2 + \mathrm i
+    p_2$. The numbers $\mathrm e^{\mathrm i \phi} a$ and $\mathrm e^{\mathrm i \phi} b$ give
+    the same $s$ for every phase $\phi$, at all times. No choice of the phase is continuous
+    on the whole sphere. Here $a > 0$ if $s_3 \ge 0$ and $b > 0$ if $s_3 < 0$, so $(p, q)$
+    jumps where $s$ crosses the equator. Derivatives of functions of $s$ are correct
+    everywhere.
 
     **Arguments:**
 
@@ -184,8 +189,8 @@ def to_spinors(s: _Spins) -> _Spinors:
     length zero, where $(p, q)$, which grows like $|s|^{1/2}$, has no derivative.
     """
     s = as_spins(s)
-    # Scaling avoids overflow and underflow of squares. The result does not depend on the
-    # scale, which therefore needs no derivative.
+    # Spins are scaled to a largest component of 1, against overflow and underflow of
+    # squares. The result does not depend on the scale, which so needs no derivative.
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(s), axis=-1, keepdims=True))
     scale = eqx.error_if(
         scale,
@@ -196,15 +201,20 @@ def to_spinors(s: _Spins) -> _Spinors:
     s1, s2, s3 = _components(s / scale)
     is_north = s3 >= 0
     length = jnp.sqrt(s1**2 + s2**2 + s3**2)
-    # The larger one of `a` and `b` is chosen real and positive. The other one follows by a
+    # The larger one of `a` and `b` is chosen real and positive. The equations
+    #     |a|^2 + |b|^2 = 4 |s|,  |a|^2 - |b|^2 = 4 s3,  a b* = 2 (s1 + i s2)
+    # give its square, 2 (|s| + |s3|). The other number follows from the last equation, by a
     # division by the larger one, which is accurate near both poles.
     larger = jnp.sqrt(2 * (length + jnp.where(is_north, s3, -s3)))
     other_q = 2 * s1 / larger
     other_p = 2 * s2 / larger
+    # In the north `a` is real and b = other_q - i other_p. In the south `b` is real and
+    # a = other_q + i other_p.
     p1 = jnp.where(is_north, 0, other_p)
     p2 = jnp.where(is_north, -other_p, 0)
     q1 = jnp.where(is_north, larger, other_q)
     q2 = jnp.where(is_north, other_q, larger)
+    # (p, q) grows like the root of |s|.
     root = jnp.sqrt(scale)
     return root * jnp.stack([p1, p2], axis=-1), root * jnp.stack([q1, q2], axis=-1)
 

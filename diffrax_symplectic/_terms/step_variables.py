@@ -37,7 +37,7 @@ class StepVariables(NamedTuple):
     """The independent random variables of a step, those of one Brownian motion after
     another.
 
-    - `laws`: the law of each variable, for a step of size 1.
+    - `laws`: the law of each variable, for a step of size 1, such as a Gaussian law.
     - `terms_with`: maps values of the variables, in units of the square root of the step
         size, to terms whose paths have the increments with these values.
     """
@@ -70,18 +70,20 @@ def step_variables(
                 "`jax.jit`, and let the function close over them."
             )
         numbers = motion_numbers(paths)
-    # Paths with the same number are one Brownian motion, whose variables are drawn once.
+    # Paths with the same number are one Brownian motion, whose variables count once. Here
+    # the first of these paths stands for the motion.
     motions = [paths[numbers.index(number)] for number in range(max(numbers) + 1)]
     laws_of_motions = [_law_of_each_variable(path) for path in motions]
+    # Where the variables of each motion end among all variables.
     ends = np.cumsum([len(laws) for laws in laws_of_motions])
 
     def terms_with(
         values: Float[Array | np.ndarray, " n"],
     ) -> PyTree[diffrax.AbstractTerm]:
-        # The values of the variables of each motion.
-        parts = jnp.split(values, ends[:-1])
-        given_paths = [_path_with(path, x, h) for path, x in zip(motions, parts)]
-        # `replace_paths` visits paths in the order of `paths`.
+        values_of_each = jnp.split(values, ends[:-1])
+        pairs = zip(motions, values_of_each)
+        given_paths = [_path_with(path, own_values, h) for path, own_values in pairs]
+        # `replace_paths` visits paths in the order of `paths`, and so of `numbers`.
         remaining_numbers = iter(numbers)
         return replace_paths(terms, lambda _: given_paths[next(remaining_numbers)])
 
@@ -121,13 +123,14 @@ def _law_of_each_variable(path: diffrax.AbstractBrownianPath) -> list[AbstractLa
 def _path_with(
     path: diffrax.AbstractBrownianPath, values: Float[Array, " n"], h: RealScalarLike
 ) -> GivenPath:
-    """A path like `path` whose increment is the same in every step: the random variables
-    have the `values`, in units of the square root of `h`."""
+    """A path like `path` whose increment is the same in every step of size `h`: its random
+    variables have the `values`, in units of the square root of `h`."""
+    # The law of each attribute of the increment, by the name of the attribute.
     laws: Any = laws_of(path)
     shape = increment_struct(path)
     zeros, unravel = zeros_and_unravel(shape)
     scaled = (jnp.sqrt(jnp.abs(h)) * values).astype(zeros.dtype)
-    # (attributes, noises): a row is one attribute of the increment.
+    # (attributes, noises): a row holds the values of one attribute of the increment.
     rows = scaled.reshape(-1, zeros.size)
     attributes = {name: unravel(row) for name, row in zip(laws, rows)}
     make_increment: Any = path.levy_area

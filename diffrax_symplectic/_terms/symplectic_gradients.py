@@ -91,9 +91,9 @@ class IndexedNoise(AbstractCaller):
 
 
 class OneNoise(eqx.Module):
-    """A control that is zero for all noises but one.
+    """A control for `HamiltonianNoise.vf_prod` that is zero for all noises but one.
 
-    - `index`: the index of this noise in the flattened control.
+    - `index`: the index of this noise in the flattened control. It may be traced.
     - `increment`: the increment of this noise.
     """
 
@@ -145,6 +145,7 @@ class Drift(AbstractCaller):
         check_pair(y)
 
         def energy(p: HalfState, q: HalfState) -> Array:
+            # At least one of the two is there.
             energies = []
             if self.H0 is not None:
                 energies.append(checked_energy("H0", self.H0, t, p, q, args=args))
@@ -172,7 +173,9 @@ class AbstractNoise(diffrax.AbstractTerm, AbstractCaller):
         return self.path.evaluate(t0, t1, **kwargs)
 
     def vf(self, t: RealScalarLike, y: _State, args: Args) -> PyTree[Array]:
-        # Diffrax's own solvers call this if they use one vector field for several controls.
+        # Column `k` is the vector field of noise `k`: the product with a control that is 1
+        # for this noise and 0 for all others. Diffrax's own solvers call this if they use
+        # one vector field for several controls.
         zeros, unravel = zeros_and_unravel(increment_struct(self.path))
 
         def product(unit: Array) -> _State:
@@ -189,7 +192,7 @@ class AbstractNoise(diffrax.AbstractTerm, AbstractCaller):
 
 class HamiltonianNoise(AbstractNoise):
     """The noise of Hamiltonians `H`, an array or a PyTree. The vector field times the
-    control `I` is the symplectic gradient of `I . H`."""
+    control `I`, the increments of the path, is the symplectic gradient of `I . H`."""
 
     noise: Hamiltonian
     path: diffrax.AbstractBrownianPath
@@ -220,24 +223,27 @@ class HamiltonianNoise(AbstractNoise):
         def dot(H: Array, increment: Array) -> Array:
             return jnp.sum(H * increment.astype(H.dtype))
 
-        # `I . H`. The noise of a step is the gradient of this one scalar, for any number of
-        # noises.
-        def energy(p: HalfState, q: HalfState) -> Any:
+        # `I . H`, a single scalar. The noise of a step is its symplectic gradient, which
+        # takes one reverse pass for any number of noises.
+        def control_dot_hamiltonians(p: HalfState, q: HalfState) -> Any:
             if not isinstance(control, OneNoise):
                 dots = jtu.tree_map(dot, hamiltonians(p, q), control)
                 return sum(jtu.tree_leaves(dots))
+            # All increments are zero but one, so `I . H` has one summand.
             if isinstance(self.noise, IndexedNoise):
+                # Only this Hamiltonian is evaluated.
                 H = self.noise.one(control.index, t, p, q, args)
             else:
+                # The function gives all Hamiltonians at once, of which one is taken.
                 flat, _ = jfu.ravel_pytree(hamiltonians(p, q))
                 H = flat[control.index]
             return H * jnp.asarray(control.increment, H.dtype)
 
-        return symplectic_gradient(energy, y)
+        return symplectic_gradient(control_dot_hamiltonians, y)
 
     def _hamiltonians(self, t, p: HalfState, q: HalfState, args: Args) -> PyTree[Array]:
-        """The noise Hamiltonians, in the structure and shapes of the path. Raises a
-        `ValueError` if they do not fit the path, or are not real."""
+        """All noise Hamiltonians, in the structure and shapes of the increments of the
+        path. Raises a `ValueError` if they do not fit the path, or are not real."""
         if isinstance(self.noise, IndexedNoise):
             # An `IndexedNoise` itself gives advice on the errors of its function.
             H = self.noise(t, p, q, args)

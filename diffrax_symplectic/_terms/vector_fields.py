@@ -38,10 +38,11 @@ def apply_one(
     t: RealScalarLike,
     y: Y,
 ) -> Y:
-    """The vector field of one noise times its increment.
+    """The change of the state by one noise: its vector field times its increment.
 
-    `index` counts the noises of all terms, in the order of their flattened controls. It may
-    be traced, so every term is evaluated; those without this noise add zero."""
+    `index` is the number of this noise among the noises of all terms, in the order of their
+    flattened controls. It may be traced. So every term is evaluated, and those without this
+    noise get the increment zero."""
     changes = []
     # The number of noises of the terms before this one.
     num_before = 0
@@ -63,8 +64,14 @@ def _one_product(
     t: RealScalarLike,
     y: Y,
 ) -> Y:
-    """The vector field of noise `k` of a term times the increment `w` of this noise. Where
-    possible, no other noise is evaluated or multiplied."""
+    """The vector field of noise `k` of a term times the increment `w` of this noise.
+
+    - Hamiltonians: only `H_k` is differentiated.
+    - A `ControlTerm` whose field is an array with a last axis of noises: only the field of
+        noise `k` is multiplied.
+    - Any other term is called with the increments of all its noises, of which all but this
+        one are zero.
+    """
     # `unwrapped(term)` tells the class of the user's term. What is called is `term` itself:
     # Diffrax may have wrapped it to run backward in time.
     if isinstance(unwrapped(term), HamiltonianNoise):
@@ -72,13 +79,11 @@ def _one_product(
     control = control_struct(term)
     if isinstance(unwrapped(term), diffrax.ControlTerm):
         field = term.vf(t, y, args)
-        # The field of noise `k` is `field[..., k]` if the increments are an array of shape
-        # `(m,)` and the field is an array of shape `(..., m)`. A scalar noise has no such
-        # axis, and a PyTree or an operator of Lineax cannot be indexed.
+        # The increments have shape `(m,)` and the field `(..., m)`. A scalar noise has no
+        # such axis, and a PyTree or an operator of Lineax cannot be indexed.
         are_arrays = isinstance(control, jax.ShapeDtypeStruct) and eqx.is_array(field)
         if are_arrays and field.ndim > 0 and field.shape[-1:] == control.shape:
             return field[..., k] * w.astype(field.dtype)
-    # All other terms only give the sum over their noises, so the other increments are zero.
     zeros, unravel = zeros_and_unravel(control)
     increments = zeros.at[k].set(w.astype(zeros.dtype))
     return term.vf_prod(t, y, args, unravel(increments))
@@ -137,7 +142,8 @@ def check_increments(terms: Terms, t0: RealScalarLike, y0: Y, args: Args) -> Non
 
 
 def _misfit(field: PyTree, increments: PyTree[Array], y0: Y) -> str:
-    """The message for a vector field that does not fit the increments of its path."""
+    """The message for a vector field that cannot be multiplied by the increments of its
+    path: an operator, the arrays of a state of several arrays, or a single array."""
     fitting_path = "Construct the path with the shape and dtype that the field takes"
     if isinstance(field, lx.AbstractLinearOperator):
         description = f"a Lineax operator on {_shapes_and_dtypes(field.in_structure())}"

@@ -127,11 +127,12 @@ class _DampedWaves(AbstractCaller):
             return checked_energy("H0", self.H0, t, psi, args=args)
 
         by_p, by_q = jax.grad(energy, argnums=(0, 1))(p, q)
-        vectors = jnp.shape(q)[:-1]
-        alpha = damping_for(_EACH, self.alpha, vectors, jnp.result_type(q))
-        # In terms of the real state, g = (by_q + i by_p) / sqrt(2) and
-        # psi = (q + i p) / sqrt(2). `real` and `imaginary` are the parts of 2 g^+ psi, and
-        # `squares` is 2 psi^+ psi. Half of alpha makes up for the factor 2.
+        alpha = damping_for(_EACH, self.alpha, jnp.shape(q)[:-1], jnp.result_type(q))
+        # In terms of the real state, psi = (q + i p) / sqrt(2) and
+        # g = (by_q + i by_p) / sqrt(2). So 2 g^+ psi = real + i imaginary and
+        # 2 psi^+ psi = squares, with the scalar products below, and sqrt(2) dpsi/dt is
+        #     dq + i dp = -i (by_q + i by_p)
+        #         + alpha/2 ((q + i p) (real + i imaginary) - (by_q + i by_p) squares).
         half_alpha = alpha[..., None] / 2
         real = _dot(by_q, q) + _dot(by_p, p)
         imaginary = _dot(by_q, p) - _dot(by_p, q)
@@ -142,7 +143,7 @@ class _DampedWaves(AbstractCaller):
 
 
 def _dot(a: Float[Array, "*vectors n"], b: Float[Array, "*vectors n"]) -> Array:
-    """The scalar products of vectors, with an axis of length one for their components."""
+    """The scalar products of vectors along the last axis, which is kept with length one."""
     return jnp.sum(a * b, axis=-1, keepdims=True)
 
 
@@ -156,14 +157,10 @@ def to_pair(psi: _Waves) -> _Pair:
 
     **Returns:** the pair `(p, q)` of real arrays, in the precision of `psi`.
     """
-
-    def momentum(psi: ArrayLike) -> Array:
-        return math.sqrt(2) * jnp.imag(jnp.asarray(psi))
-
-    def position(psi: ArrayLike) -> Array:
-        return math.sqrt(2) * jnp.real(jnp.asarray(psi))
-
-    return jtu.tree_map(momentum, psi), jtu.tree_map(position, psi)
+    arrays = jtu.tree_map(jnp.asarray, psi)
+    p = jtu.tree_map(lambda x: math.sqrt(2) * jnp.imag(x), arrays)
+    q = jtu.tree_map(lambda x: math.sqrt(2) * jnp.real(x), arrays)
+    return p, q
 
 
 def from_pair(y: _Pair) -> _Waves:

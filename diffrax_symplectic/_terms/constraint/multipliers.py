@@ -28,7 +28,8 @@ class _Newton(NamedTuple):
     """The state of Newton's method.
 
     - `x`: the multipliers.
-    - `residual`: the values of the constraints before the last correction.
+    - `residual`: the values of the constraints before the last correction, which was to
+        make them zero.
     - `correction`: the last correction, which was subtracted from the multipliers.
     - `remaining`: how many corrections may follow; `_SOLVED` if the method has converged,
         and 0 if it failed. (With three arrays in place of this one, a count and two flags,
@@ -61,8 +62,13 @@ def find_multipliers(
     - `pending`: if false, no step is taken and nothing is found, so that in a batch a path
         that failed before does not keep the others waiting.
 
-    The method ends when the next correction would be below rounding errors. Its size is
-    estimated from the change of the derivative along the last one.
+    Newton's method ends when the next correction would be below rounding errors. Each step
+
+    1. computes a correction;
+    2. estimates how small the next correction would be, from the change of the derivative
+        of `residual` along the last correction;
+    3. ends the method if the next correction would change no constraint by more than
+        rounding errors.
 
     It would not do to wait for a correction below the rounding errors of the positions. It
     may never be so small: near the origin `(q - 1)**2 - 1` is a difference of numbers that
@@ -78,19 +84,22 @@ def find_multipliers(
 
     def step(state: _Newton) -> _Newton:
         newton = correction(residual, state.x, None)
-        # The most that this correction, and the one before it, change each constraint.
+        # The most that this correction, and the last one, change each constraint.
         change = weighted_sum(jnp.abs(newton.change), slopes)
         change_before = weighted_sum(jnp.abs(state.correction), slopes) + rounding
-        # How much the derivative along the correction before has changed by it. The old
-        # derivative times that correction was `state.residual`, which it was to remove.
+        # How much the derivative along the last correction has changed by that correction.
+        # The old derivative times the last correction was `state.residual`.
         bend = jnp.abs(newton.derivative(state.correction) - state.residual)
-        # The next correction is at most this fraction of this one. (Half of `bend` is what
-        # the correction before left to this one. The square of the ratio of these two is
-        # left to the next: Deuflhard, Newton Methods for Nonlinear Problems, 2004, section
-        # 2.1.) Ratios are taken constraint by constraint, since these differ in units.
+        # Convergence is quadratic: if this correction is r times the last one, the next one
+        # is about r^2 times this one. There are two estimates of r, `change /
+        # change_before` and `bend / change_before / 2`, since the last correction has left
+        # half of `bend` in the constraints. Their product without the factor 1/2 is on the
+        # safe side. (Deuflhard, Newton Methods for Nonlinear Problems, 2004, section 2.1.)
+        # Ratios are taken constraint by constraint, since these differ in units.
         fraction = max_norm(change / change_before) * max_norm(bend / change_before)
         # The first correction has no other before it, from which to estimate the next one.
         fraction = jnp.where(state.remaining < _MOST_STEPS, fraction, 1)
+        # `change * fraction`: the most that the next correction changes each constraint.
         # The inequality is strict, since infinite corrections, for which both sides are
         # infinite, solve nothing.
         is_solved = jnp.all(change * fraction < rounding + relative_rounding * change)
@@ -116,9 +125,9 @@ def find_multipliers(
 
 
 def solve_tangent(apply: Callable, rhs: Multipliers) -> Multipliers:
-    """Solves the linear equations `apply(x) = rhs` for the derivative of the multipliers,
-    in the form that `lax.custom_root` asks for."""
-    # The columns are the images of the unit vectors.
+    """The solution `x` of the linear equations `apply(x) = rhs`: the `tangent_solve` of
+    `lax.custom_root`, for the derivative of the multipliers."""
+    # The columns of the matrix of `apply` are the images of the unit vectors.
     matrix = jax.vmap(apply, out_axes=1)(jnp.eye(len(rhs), dtype=rhs.dtype))
     return solve_matrix(matrix, rhs)
 

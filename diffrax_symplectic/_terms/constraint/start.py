@@ -48,9 +48,12 @@ def check_start(
     masses that are not constant.
 
     Returns two flags: whether the constraints are linearly dependent at `y0`, and whether
-    `y0` is off the constraints. A flag that is true raises a `ValueError` if it is known
-    while tracing, and otherwise an error when run. Under `vmap` nothing is raised, and the
-    caller has to make the path fail."""
+    `y0` is off the constraints. What a flag that is true does:
+
+    - if it is known while tracing, it raises a `ValueError`;
+    - under `vmap` it raises nothing, and the caller has to make the path fail;
+    - otherwise it raises an error when run.
+    """
     _check_constant_masses(terms, t0, y0, args)
     # Flags have no derivative. Without `stop_gradient`, `grad` would differentiate the
     # operations of the checks all the same.
@@ -80,19 +83,19 @@ def _start_faults(
 def _check_constant_masses(
     terms: PyTree[diffrax.AbstractTerm], t0: RealScalarLike, y0: PyTree, args: Args
 ) -> None:
-    """Raises a `ValueError` unless the masses are constant, that is, unless the velocities
-    are linear in the momenta up to a constant."""
+    """Raises a `ValueError` unless the masses are constant, that is, unless the second
+    derivative of H0 by the momenta, the inverse `M^-1` of the masses, does not depend on
+    the momenta."""
     surface = Surface.of(terms, t0, y0, args)
     p0, _ = y0
     flat_p0, _ = jfu.ravel_pytree(p0)
 
-    # The second derivative of H0 by p, times an impulse, which is a change of the momentum.
+    # `M^-1` times an impulse, which is a change of the momentum.
     def change_of_velocity(p: Vector, impulse: Vector) -> Vector:
         _, change = jax.jvp(surface.velocity, (p,), (impulse,))
         return change
 
-    # The masses are constant if this change depends on the impulse, but not on the momentum
-    # `p`. The second `flat_p0` stands for an impulse, of which only the shape counts.
+    # Only shapes count here. The second `flat_p0` stands for an impulse.
     dependence = Dependence(change_of_velocity, flat_p0, flat_p0)
     if not dependence.independent(of=lambda p, impulse: p):
         raise ValueError(
@@ -156,6 +159,7 @@ def constrained_state(
         )
     _check_constant_masses(terms, t, y0, args)
     y1, found, is_dependent = _projection(terms, t, y0, args)
+    # Traced flags cannot raise an error.
     if not is_traced(found):
         if is_dependent:
             raise ValueError(_DEPENDENT)
@@ -178,7 +182,8 @@ def _projection(
     p0, q0 = y0
     p, unravel_p = jfu.ravel_pytree(p0)
     q, unravel_q = jfu.ravel_pytree(q0)
-    # In a free flight without momentum only the multipliers move the positions.
+    # A free flight ends at positions that the constraint allows. Without momentum only the
+    # multipliers move the positions, along `M^-1 J^T`.
     no_momentum = jnp.zeros_like(p)
     normal_space = surface.normal_space(q)
     _, q, found = surface.free_flight(no_momentum, normal_space, time=1.0)

@@ -113,11 +113,12 @@ class Surface(NamedTuple):
         normal_space: NormalSpace,
         response: Callable[[Vector], Vector] | None = None,
     ) -> Vector:
-        """The momentum `p` after the impulses of the constraint forces that make it
-        tangent.
+        """The momentum `p` after the impulse of the constraint forces that makes it
+        tangent: `p - J^T x` with `J v = 0`, so `(J M^-1 J^T) x = J v(p)`.
 
-        By default an impulse `x` changes the momentum by `x`. With `response` it changes
-        the momentum by `response(x)`, for example if friction acts on the impulse."""
+        By default an impulse changes the momentum by the impulse itself. With `response`
+        it changes the momentum by `response(impulse)`, for example if friction acts on the
+        impulse. Then `response(J^T)` takes the place of `J^T`."""
         # `changes`: the change of the momentum by each normal as an impulse, (c, n).
         # `gram`: the change of `J v` by each of `changes`, (c, c).
         if response is None:
@@ -139,10 +140,11 @@ class Surface(NamedTuple):
     ) -> tuple[Vector, Vector, Bool[Array, ""]]:
         r"""Free flight on the surface over the `time` $h$, by a step of RATTLE,
 
-        $$q_1 = q + h\, v(p_1), \qquad p_1 = p - J(q)^\top \lambda, \qquad g(q_1) = 0.$$
+        $$q_1 = q + h\, v(p_1), \qquad p_1 = p - J(q)^\top \lambda, \qquad g(q_1) = 0,$$
 
-        Returns $p_1$, $q_1$ and whether the multipliers $\lambda$ were found. If not
-        `pending`, nothing is solved, and they are not found.
+        from the position $q$ of the `normal_space`. Returns $p_1$, $q_1$ and whether the
+        multipliers $\lambda$ were found. If not `pending`, as for a path that failed
+        before, nothing is solved, and they are not found.
 
         The momentum $p_1$ still has to be made tangent at $q_1$. The momentum $p$ need not
         be tangent: the multipliers make up for its normal part.
@@ -152,8 +154,8 @@ class Surface(NamedTuple):
         unconstrained_q = normal_space.q + time * self.velocity(p)
         rounding = _rounding(normal_space, unconstrained_q)
 
-        # The unknowns are `x = h lambda`, since the position hardly depends on `lambda` if
-        # `h` is small. The impulse `-J^T lambda` changes the velocity by
+        # `q_1` for the unknowns `x = h lambda`. (The position hardly depends on `lambda` if
+        # `h` is small.) The impulse `-J^T lambda` changes the velocity by
         # `-M^-1 J^T lambda`, and so the position after the time `h` by `-M^-1 J^T x`.
         def end_position(x: Multipliers) -> Vector:
             return unconstrained_q - weighted_sum(x, normal_space.velocity_changes)
@@ -177,31 +179,36 @@ class Surface(NamedTuple):
         return p1, end_position(x), found > 0
 
     def is_dependent(self, normal_space: NormalSpace) -> Bool[Array, ""]:
-        """Whether the normals are linearly dependent, up to rounding errors."""
+        """Whether the normals are linearly dependent, up to rounding errors: whether the
+        angle between one of them and the space of those before it is about zero."""
         # Backward in time, velocities change their sign, and with them the Gram matrix.
         gram = normal_space.gram * jnp.sign(jnp.trace(normal_space.gram))
         lengths = jnp.sqrt(jnp.diag(gram))
-        # The cosines of the angles between normals. Each pivot of their Cholesky factor is
-        # the squared sine of the angle between a normal and the space of those before it.
+        # The cosines of the angles between normals. Each pivot of their Cholesky factor, a
+        # squared diagonal entry, is the squared sine of an angle to the normals before.
         cosines = gram / lengths / lengths[:, None]
         pivots = jnp.diag(jnp.linalg.cholesky(cosines)) ** 2
         rounding = 1000 * jnp.finfo(gram.dtype).eps
-        # `>` is false for NaN, which comes from a normal that is zero, or where there is no
-        # Cholesky factor.
+        # Not `any(pivots <= rounding)`, which would be false for NaN. NaN comes from a
+        # normal that is zero, or where there is no Cholesky factor.
         return ~jnp.all(pivots > rounding)
 
     def is_off(self, p: Vector, normal_space: NormalSpace) -> Bool[Array, ""]:
-        """Whether a state is farther from the surface than rounding errors explain."""
+        """Whether a state is farther from the surface than rounding errors explain: whether
+        its position, that of the `normal_space`, is not on the surface, or its momentum `p`
+        is not tangent."""
         # Two thirds of the digits have to agree. This bound lies above the rounding errors
         # of long sums, and below what a mistake of the user's gives.
         eps = float(jnp.finfo(p.dtype).eps)
         bound = eps ** (2 / 3)
         q = normal_space.q
-        # Each constraint is zero since terms of this size cancel in it. The size follows
-        # from that of the positions or, near the origin, from the curvature of the surface.
+        # The size of the terms that cancel in each constraint, such as one for `q^2 - 1`.
+        # It follows from the size of the positions or, near the origin, from the curvature
+        # of the surface.
         size = jnp.maximum(
             _rounding(normal_space, q) / eps, self._size_by_curvature(normal_space)
         )
+        # Both comparisons are false for NaN, so a state with NaN is off.
         position_is_on = jnp.all(jnp.abs(self.residual(q)) <= bound * size)
         normal_part = p - self.tangent(p, normal_space)
         momentum_is_tangent = max_norm(normal_part) <= bound * max_norm(p)
@@ -209,11 +216,12 @@ class Surface(NamedTuple):
 
     def _size_by_curvature(self, normal_space: NormalSpace) -> Float[Array, " c"]:
         r"""An estimate of the size of the terms that cancel in each constraint $g$, such as
-        one for $q^2 - 1$. Zero for a plane.
+        one for $q^2 - 1$: the gradient times the radius of curvature,
+        $|g'| \cdot |g'| / |g''|$, with $g''$ along an arbitrary direction. It is zero for a
+        plane.
 
-        It is the gradient times the radius of curvature, $|g'| \cdot |g'| / |g''|$, with
-        $g''$ along an arbitrary direction. It matters near the origin: there the positions
-        are smaller than these terms, and so are their rounding errors.
+        It matters near the origin: there the positions are smaller than these terms, and so
+        are their rounding errors.
         """
         q = normal_space.q
         # An arbitrary direction, which no symmetry of the constraint singles out.

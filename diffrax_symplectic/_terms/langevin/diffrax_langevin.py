@@ -40,9 +40,9 @@ def momentum_first(
 
 
 def _exchanged(term: diffrax.AbstractTerm) -> list[diffrax.AbstractTerm]:
-    """A term of the state `(x, v)` as terms of the state `(v, x)`. The friction of
-    Diffrax's Langevin drift becomes a term of its own, which solvers for heat baths find.
-    """
+    """A term of the state `(x, v)` as terms of the state `(v, x)`: two terms for Diffrax's
+    Langevin drift, whose friction becomes a term of its own, which solvers for heat baths
+    find; and one for any other term."""
     if isinstance(term, diffrax.UnderdampedLangevinDriftTerm):
         # The `gamma` of Diffrax acts on velocities of mass one, as the friction here does.
         friction = _PrefixFriction(term.gamma)
@@ -90,7 +90,8 @@ class _PrefixFriction(AbstractFriction):
     def force(self, t, q, args, velocity):
         del t, q, args
 
-        # One leaf of `gamma` may stand for several arrays of velocities, a subtree.
+        # `tree_map` below pairs each leaf of `gamma` with the velocities that it stands
+        # for: an array, or a subtree of several arrays.
         def force_on_subtree(gamma: ArrayLike, subtree: _Half) -> _Half:
             return jtu.tree_map(
                 lambda v: -not_negative(in_precision_of(gamma, v)) * v, subtree

@@ -5,7 +5,7 @@ A friction has one of three forms:
 
 - numbers for each array of the momenta, which multiply them entry by entry;
 - a matrix: an operator of Lineax, or a `_Matrix` if it is constant;
-- directions: a `FrictionAlong`.
+- directions: a `FrictionAlong`, here also called columns, as those of a matrix.
 
 Numbers and matrices may also be the values of a function `(t, q, args)`.
 """
@@ -106,27 +106,30 @@ def value_at(name: str, value: Any, t, q: _HalfState, args: Args) -> Any:
 def product_with(
     friction: Any, t, q: _HalfState, args: Args, velocity: _HalfState
 ) -> _HalfState:
-    """`G v` for the user's friction `G` in any of its forms, and `v = velocity`. NaN where
-    numbers are negative, or if a constant matrix is not semidefinite."""
+    """`G v` for the user's friction `G` in any of its forms, and `v = velocity`:
+
+    - directions `d_k`: `sum_k d_k (d_k . v)`, which costs less than to form the matrix;
+    - a matrix times the flattened velocities;
+    - numbers `g`: `g v`, entry by entry.
+
+    NaN where numbers are negative, or if a constant matrix is not semidefinite. For the
+    matrix of a function this is not checked: then its root in the noise is NaN."""
     if isinstance(friction, FrictionAlong):
-        # G v = sum_k d_k (d_k . v), which costs less than to form the matrix. Each array of
-        # momenta gives one summand of the scalar products `d_k . v`.
         columns = _checked_columns(friction, t, q, args)
-        speeds = jtu.tree_map(
+        # Each array of the momenta gives one summand of the scalar products `d_k . v`.
+        summands = jtu.tree_map(
             lambda d, v: jnp.tensordot(v, d, axes=jnp.ndim(v)), columns, velocity
         )
-        total_speeds = sum(jtu.tree_leaves(speeds))
-        return jtu.tree_map(lambda directions: directions @ total_speeds, columns)
+        scalar_products = sum(jtu.tree_leaves(summands))
+        return jtu.tree_map(lambda d: d @ scalar_products, columns)
     value = value_at("friction", friction, t, q, args)
     if _is_matrix(value):
-        # A matrix from a function may not be semidefinite. Then its root in the noise is
-        # NaN.
         matrix = _checked_matrix(value, q, "the momenta")
         flat_v, unravel = jfu.ravel_pytree(velocity)
         return unravel(in_precision_of(matrix, flat_v) @ flat_v)
-    values = _checked_numbers("friction", value, q)
+    numbers = _checked_numbers("friction", value, q)
     return jtu.tree_map(
-        lambda g, v: not_negative(in_precision_of(g, v)) * v, values, velocity
+        lambda g, v: not_negative(in_precision_of(g, v)) * v, numbers, velocity
     )
 
 
@@ -134,26 +137,16 @@ def root_product_with(
     friction: Any, T: PyTree, t, q: _HalfState, args: Args, control: BM
 ) -> _HalfState:
     """`B w` for the user's friction `G` in any of its forms and the increments
-    `w = control`, with `B B^T = 2 T G`. Raises a `ValueError` if the shapes of the
-    increments do not fit the friction or the momenta."""
+    `w = control`, with `B B^T = 2 T G`:
+
+    - directions `d_k`: `B = sqrt(2 T) (d_1, ..., d_m)`, one column for each direction;
+    - a matrix: `B = sqrt(2 T) L` with `L L^T = G`;
+    - numbers `g`: `B` is diagonal, with `sqrt(g) sqrt(2 T)` on its diagonal.
+
+    NaN where `g` or `T` is negative, or if a matrix is not semidefinite. Raises a
+    `ValueError` if the shapes of the increments do not fit the friction or the momenta."""
     if isinstance(friction, FrictionAlong):
-        # B = sqrt(2 T) (d_1, ..., d_m), one column for each direction.
-        columns = _checked_columns(friction, t, q, args)
-        T = _checked_single_temperature(T)
-        flat_w, _ = jfu.ravel_pytree(control)
-        # `(m,)` for `m` directions. All arrays of momenta have the same directions.
-        noise_shape = jnp.shape(jtu.tree_leaves(columns)[0])[-1:]
-        if noise_shape != flat_w.shape:
-            raise ValueError(
-                "The `path` of `langevin_terms` must have one noise for each direction of "
-                f"the friction, shape {noise_shape}; got shape {shapes(control)}."
-            )
-
-        def kick_along(directions: Array) -> Array:
-            scale = _root(2 * in_precision_of(T, directions))
-            return directions @ (scale * in_precision_of(flat_w, directions))
-
-        return jtu.tree_map(kick_along, columns)
+        return _root_product_along(friction, T, t, q, args, control)
     if not _have_same_shapes(control, q):
         raise ValueError(
             f"The `path` of `langevin_terms` must have the shape of `q`, {shapes(q)}; got "
@@ -161,7 +154,6 @@ def root_product_with(
         )
     value = value_at("friction", friction, t, q, args)
     if _is_matrix(value):
-        # B = sqrt(2 T) L with L L^T = G.
         matrix = _checked_matrix(value, q, "the momenta")
         root = value.root if isinstance(value, _Matrix) else _root_of_matrix(matrix)
         flat_q, unravel = jfu.ravel_pytree(q)
@@ -169,16 +161,38 @@ def root_product_with(
         scale = _root(2 * in_precision_of(_checked_single_temperature(T), flat_q))
         w = in_precision_of(flat_w, flat_q)
         return unravel(scale * (in_precision_of(root, flat_q) @ w))
-    # G and B are diagonal.
     numbers = _checked_numbers("friction", value, q)
     temperatures = _checked_numbers("temperature", T, q)
 
     def kick(g: ArrayLike, T: ArrayLike, w: Array, x: Array) -> Array:
-        # Where `g` or `T` is negative, its root is NaN, which makes the path fail.
+        # `x` is an array of positions, in whose precision the result is computed.
         scale = _root(in_precision_of(g, x)) * _root(2 * in_precision_of(T, x))
         return scale * in_precision_of(w, x)
 
     return jtu.tree_map(kick, numbers, temperatures, control, q)
+
+
+def _root_product_along(
+    friction: FrictionAlong, T: PyTree, t, q: _HalfState, args: Args, control: BM
+) -> _HalfState:
+    """`sqrt(2 T) sum_k d_k w_k` for the directions `d_k` of a friction: `root_product_with`
+    for this form."""
+    columns = _checked_columns(friction, t, q, args)
+    T = _checked_single_temperature(T)
+    flat_w, _ = jfu.ravel_pytree(control)
+    # `(m,)` for `m` directions. All arrays of momenta have the same directions.
+    noise_shape = jnp.shape(jtu.tree_leaves(columns)[0])[-1:]
+    if noise_shape != flat_w.shape:
+        raise ValueError(
+            "The `path` of `langevin_terms` must have one noise for each direction of "
+            f"the friction, shape {noise_shape}; got shape {shapes(control)}."
+        )
+
+    def kick(d: Array) -> Array:
+        scale = _root(2 * in_precision_of(T, d))
+        return d @ (scale * in_precision_of(flat_w, d))
+
+    return jtu.tree_map(kick, columns)
 
 
 def _have_same_shapes(a: PyTree, b: PyTree) -> bool:
@@ -249,11 +263,13 @@ def _checked_numbers(
     name: str, value: PyTree, momenta: PyTree, called: str = "its momenta"
 ) -> PyTree:
     """The numbers of the user's argument `name`, a friction or temperature, in the
-    structure of the momenta. Messages call the momenta `called`, since `momenta` may be a
-    path in their place.
+    structure of the momenta. Raises a `ValueError` unless the argument has, for each array
+    of the momenta, a single number or an array that fits axis by axis.
 
-    For each array of the momenta, raises a `ValueError` unless the argument has a single
-    number, or an array with as many axes, each as long as that of the momenta or of length
+    Messages call the momenta `called`. Before the solve `momenta` are the shapes of the
+    path, which are those of the momenta.
+
+    To fit, an array needs as many axes as the momenta, each as long as theirs or of length
     one. (NumPy would also add axes in front. For three particles in space, an array of
     shape `(3,)` would then hold one number for each axis of space. More often one for each
     particle is meant.)"""
@@ -264,9 +280,11 @@ def _checked_numbers(
         if shape == () or _fits_axis_by_axis(shape, momenta_shape):
             continue
         advice = ""
+        # One number for each particle, in a vector.
         if len(momenta_shape) > 1 and shape == momenta_shape[:1]:
             axes = ", ".join([":"] + ["None"] * (len(momenta_shape) - 1))
             advice += f" For one number for each particle pass `{name}[{axes}]`."
+        # Probably a matrix.
         if name == "friction" and len(shape) == 2 and shape[0] == shape[1]:
             has_axes = len(momenta_shape) > 1
             advice += f" {_PASS_BLOCKS}." if has_axes else f" Pass {_PASS_MATRIX}."
@@ -323,9 +341,9 @@ def not_negative(friction: Array) -> Array:
 def _root(x: Array) -> Array:
     """The square root, with the derivative zero at zero; NaN for negative numbers.
 
-    A friction or temperature may be zero in a part of space. There its derivatives are zero
-    along most directions. Times the derivative of `jnp.sqrt` at zero, which is infinite,
-    they would become NaN.
+    A friction or temperature may be zero in a part of space, where its derivatives are zero
+    along most directions. The derivative of `jnp.sqrt` at zero is infinite, and infinity
+    times zero would be NaN.
     """
     positive = x > 0
     # Both branches of a `where` are differentiated, so neither may have an infinite
@@ -383,7 +401,8 @@ def _constant_matrix(
     """The matrix of a constant friction, with its root. Raises a `ValueError` if it does
     not fit the path, or if it is known not to be symmetric positive semidefinite."""
     structure = operator.in_structure()
-    # Without a path the operator is compared with the momenta only in the solve.
+    # The path has the shapes of the momenta. Without a path the operator is compared with
+    # itself here, and with the momenta in the solve.
     momenta = structure if path_struct is None else path_struct
     matrix = _checked_matrix(operator, momenta, _PATH_AND_MOMENTA)
     # The root is NaN if the matrix is not symmetric positive semidefinite.
@@ -425,6 +444,10 @@ def semidefinite_root(square: Float[Array, "n n"]) -> Float[Array, "n n"]:
     matrix: its Cholesky factor, with zero columns where `square` is singular. NaN if
     `square` is not symmetric positive semidefinite.
 
+    Columns are computed one after another, by Cholesky's method: the column `j` of `L` is
+    the column `j` of the remainder, `square` minus the products of the earlier columns,
+    over the root of its entry `(j, j)`, the pivot.
+
     A pivot that is a rounding error gives a zero column. Its root would be far larger than
     a rounding error: with it, a friction between particles would change their total
     momentum.
@@ -434,22 +457,24 @@ def semidefinite_root(square: Float[Array, "n n"]) -> Float[Array, "n n"]:
     diagonal = jnp.diag(square)
     # The rounding error of each pivot, a difference of numbers up to the diagonal entry.
     rounding = 10 * n * eps * diagonal
-    # A bound on the remainder of a semidefinite matrix after all columns. Its entry (i, j)
-    # is at most the root of the product of its diagonal entries i and j. Entries are left
-    # only for columns that are zero, where the diagonal entry is below `rounding`.
+    # A bound on the entries r_ij of the remainder of a semidefinite matrix, after all
+    # columns. An entry is left only if the pivot of its row or column, say of row i, was a
+    # rounding error. Then the entry was at most sqrt(r_ii r_jj), with r_ii <= rounding[i]
+    # and r_jj <= diagonal[j]. The bound is three times as large.
     root_of_diagonal = jnp.sqrt(jnp.maximum(diagonal, 0))
     largest_remainder = (
         10 * (n * eps) ** 0.5 * root_of_diagonal[:, None] * root_of_diagonal
     )
 
     def with_column(j: Any, carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        """One step of Cholesky's method: `carry` after column `j` of the root. It holds the
-        remainder of the matrix, the columns of the root so far, and whether the matrix may
-        still be semidefinite."""
+        """`carry` after column `j`: the remainder of the matrix, the columns of the root so
+        far, and whether the matrix may still be semidefinite."""
         remainder, root, is_valid = carry
         pivot = remainder[j, j]
+        # If not, the column is zero.
         is_used = pivot > rounding[j]
         entries = remainder[:, j] / jnp.sqrt(jnp.where(is_used, pivot, 1))
+        # The root is a lower triangular matrix.
         entries = jnp.where(is_used & (jnp.arange(n) >= j), entries, 0)
         remainder = remainder - entries[:, None] * entries
         is_valid = is_valid & (pivot >= -rounding[j])

@@ -120,6 +120,8 @@ def langevin_terms(
     semidefinite; and, while the solve is traced, if their shapes do not fit. Paths fail
     where this is not known before.
     """
+    # Drift and friction become one term, whose vector field is a `Drift` with the friction
+    # of the bath. The constraint comes around both.
     (frictionless,) = hamiltonian_terms(H0, structure=structure, slow=slow).terms
     friction_term, *noise = bath_terms(H0, friction, temperature, path).terms
     field = dataclasses.replace(

@@ -63,9 +63,11 @@ def _breaks_structure(
     args: Args,
 ) -> Bool[Array, ""]:
     """Whether a value or derivative that the structure forbids is larger than rounding
-    errors, along any of some random directions.
+    errors, for any of some random directions of the state and controls, at `y0` or at a
+    state nearby.
 
-    The change of the state by the term is (dp, dq). The structures forbid:
+    The change of the state by the term, its vector field times a control, is (dp, dq). The
+    structures forbid:
 
     - "additive": derivatives of dp and dq by p and q;
     - "separable", for noise: dq with all its derivatives, and derivatives of dp by p;
@@ -74,14 +76,16 @@ def _breaks_structure(
     zeros, unravel = zeros_and_unravel((y0, control_struct(term, t0)))
     # What counts as larger than rounding errors, as a fraction of the largest value or
     # derivative. The threshold lies above the errors of long sums, and below what a mistake
-    # gives. Its dtype is that of the state, since times may have more digits.
+    # gives. `eps` is that of the dtype of the state, since times may have more digits.
     eps = float(jnp.finfo(jnp.result_type(*jtu.tree_leaves(y0))).eps)
     threshold = eps ** (2 / 3)
 
+    # The distance of the state nearby, in each direction.
     largest = largest_entry(y0)
     distance = _RELATIVE_DISTANCE * jnp.where(largest > 0, largest, 1)
 
     def is_broken_at(y: Y, dy: Y, control: PyTree[Array]) -> Bool[Array, ""]:
+        # `dp_by_q` is the derivative of dp along the direction `along_q`, and so on.
         along_p, along_q = dy
         zero = jtu.tree_map(jnp.zeros_like, along_p)
 
@@ -103,6 +107,7 @@ def _breaks_structure(
             forbidden = [dq, dq_by_p, dq_by_q, dq_by_t, dp_by_p]
         else:
             forbidden = [dp_by_p, dq_by_q, dq_by_t]
+        # The forbidden ones are compared with all values and derivatives.
         of_p = [dp, dp_by_p, dp_by_q, dp_by_t]
         of_q = [dq, dq_by_p, dq_by_q, dq_by_t]
         # False for NaN, or for infinity on both sides: then nothing is known.

@@ -3,6 +3,9 @@ the vector fields depend on, or by the user's assertion.
 
 Here a Hamiltonian term is one from `hamiltonian_terms` or `langevin_terms`. A plain term is
 any other, such as a `diffrax.ODETerm` of the user's.
+
+The state is a pair `(p, q)`. Its first element, number 0, holds the momenta, and its second
+element, number 1, the positions. They are called the halves of the state.
 """
 
 from typing import Any, get_args, NamedTuple
@@ -45,9 +48,7 @@ _GENERAL = (
 )
 _GENERAL_BATH = (
     "use `BAOAB(ImplicitMidpoint())`, for any H0 that is quadratic in p, or a solver for "
-    "general systems, such as `ImplicitMidpoint`"
-)
-_NO_GRADIENT = (
+    "general systems, such as `ImplicitMidpoint`. "
     "A force that is not the gradient of a potential, as of an active particle, is no part "
     "of H0, and no `structure` makes it one: add it as a term of its own, `diffrax."
     "MultiTerm(*terms.terms, diffrax.ODETerm(lambda t, y, args: (force, zeros)))`, which "
@@ -72,10 +73,11 @@ class Fault(NamedTuple):
 
     - `cause`: what is wrong, as a part of a sentence.
     - `advice`: what to do, in sentences.
-    - `wrong_way_round`: whether with the halves of the state exchanged nothing would be
-        wrong, or only friction.
-    - `friction`: whether only friction is wrong, a force of plain terms that depends on the
-        momentum. If `wrong_way_round`, this is so with the halves exchanged.
+    - `friction`: whether all that is wrong is what a friction would cause: in plain terms,
+        the change of the momenta depends on the momenta.
+    - `wrong_way_round`: whether the state seems to be `(q, p)`: with its halves exchanged
+        nothing is wrong, or only what a friction would cause. Then `friction` holds for the
+        exchanged halves.
     """
 
     cause: str
@@ -115,6 +117,8 @@ def check_structure(
         )
 
     def raise_if(fault: Fault | None, needs: str) -> None:
+        """Raises the error for a fault, if there is one. `needs` is the form of a system
+        that the solver needs, in words."""
         if fault is None:
             return
         advice = fault.advice
@@ -141,7 +145,20 @@ def separable_fault(
     drift: Terms, noise: Terms, t0: RealScalarLike, y0: Y, args: Args
 ) -> Fault | None:
     """Why the system is not of the form `H0 = V(p) + U(t, q)`, `H_k = U_k(t, q)`; `None` if
-    it is."""
+    it is.
+
+    If something other than friction is wrong with the state `(p, q)`, the state may be
+    (position, velocity), in the order of many other packages. So the system is also checked
+    with the halves of the state exchanged. The flags of the fault follow from what is wrong
+    in each order:
+
+    | as `(p, q)`   | with exchanged halves | `friction` | `wrong_way_round` |
+    | ------------- | --------------------- | ---------- | ----------------- |
+    | only friction | (not checked)         | true       | false             |
+    | anything else | nothing               | false      | true              |
+    | anything else | only friction         | true       | true              |
+    | anything else | anything else         | false      | false             |
+    """
     if advice := pair_fault(y0):
         return Fault("the state is not a pair (p, q)", advice)
     # The friction of `langevin_terms` becomes a term of its own. Then the faults of the
@@ -151,7 +168,8 @@ def separable_fault(
         return fault
 
     def traced(terms: Terms) -> _TracedTerms:
-        """Those terms whose structure the user has not asserted."""
+        """The terms whose structure the user has not asserted, and which so are checked,
+        each with what it depends on."""
         to_trace = [term for term in terms if asserted_structure(term) != "separable"]
         return [(term, _dependence(term, t0, y0, args)) for term in to_trace]
 
@@ -159,35 +177,33 @@ def separable_fault(
     traced_noise = traced(noise)
 
     def faults_if(momenta: int) -> list[Fault]:
-        """All reasons why the system is not separable, if the momenta are the half of the
-        state with this number, 0 or 1."""
+        """All reasons why the system is not separable, if the half of the state with the
+        number `momenta`, 0 or 1, holds the momenta."""
         drift_faults = _drift_faults(traced_drift, momenta)
         return drift_faults + _noise_faults(traced_noise, momenta, t0, y0, args)
 
     faults = faults_if(momenta=0)
     if len(faults) == 0:
         return None
-    first = faults[0]
-    by_friction = first._replace(advice=f"{FRICTION} {first.advice}", friction=True)
-    if all(fault.friction for fault in faults):
-        return by_friction
-    # The state may be (position, velocity), in the order of many other packages.
-    faults_if_exchanged = faults_if(momenta=1)
-    if len(faults_if_exchanged) == 0:
-        return first._replace(friction=False, wrong_way_round=True)
-    if all(fault.friction for fault in faults_if_exchanged):
-        return by_friction._replace(wrong_way_round=True)
-    # Something other than friction is wrong in both orders.
-    return first._replace(friction=False)
+    only_friction = all(fault.friction for fault in faults)
+    wrong_way_round = False
+    if not only_friction:
+        faults_if_exchanged = faults_if(momenta=1)
+        # This is also true if there are no faults.
+        wrong_way_round = all(fault.friction for fault in faults_if_exchanged)
+        only_friction = wrong_way_round and len(faults_if_exchanged) > 0
+    # Of several faults the first one is reported.
+    cause = faults[0].cause
+    advice = f"{FRICTION} {faults[0].advice}" if only_friction else faults[0].advice
+    return Fault(cause, advice, friction=only_friction, wrong_way_round=wrong_way_round)
 
 
 def _drift_faults(traced_drift: _TracedTerms, momenta: int) -> list[Fault]:
-    """The reasons why drift terms are not those of a separable system, if the momenta are
-    the half of the state with this number, 0 or 1. A fault of `friction` is one that a
-    friction would cause."""
+    """The reasons why drift terms are not those of a separable system, if the half of the
+    state with the number `momenta`, 0 or 1, holds the momenta."""
     positions = 1 - momenta
-    # Each rule: the change of one half of the state must not depend on an input. Then the
-    # name of the fault in a Hamiltonian term, and in a plain term.
+    # Each rule, `(half, on, ...)`: the change of this half of the state must not depend on
+    # this input. Then what is wrong otherwise, as said of a Hamiltonian and a plain term.
     rules = (
         (momenta, momenta, "dH0/dq depends on p", "dp/dt depend on p"),
         (positions, positions, "dH0/dp depends on q", "dq/dt depend on q"),
@@ -196,38 +212,40 @@ def _drift_faults(traced_drift: _TracedTerms, momenta: int) -> list[Fault]:
     beside = " besides H0" if len(traced_drift) > 1 else ""
     faults = []
     for term, dependence in traced_drift:
-        is_plain = not is_hamiltonian(term)
         advice = _advice("separable", term)
-        for half, on, cause, cause_if_plain in rules:
+        for half, on, in_hamiltonian, in_plain in rules:
             if not _depends(dependence, half, on):
                 continue
-            if is_plain:
-                cause = f"a drift term{beside} makes {cause_if_plain}"
-            by_friction = is_plain and half == momenta
-            faults.append(Fault(cause, advice, friction=by_friction))
+            if is_hamiltonian(term):
+                faults.append(Fault(in_hamiltonian, advice))
+            else:
+                cause = f"a drift term{beside} makes {in_plain}"
+                # A friction breaks only the first rule, that of the momenta.
+                faults.append(Fault(cause, advice, friction=half == momenta))
     return faults
 
 
 def _noise_faults(
     traced_noise: _TracedTerms, momenta: int, t0: RealScalarLike, y0: Y, args: Args
 ) -> list[Fault]:
-    """The reasons why noise terms are not those of a separable system, if the momenta are
-    the half of the state with this number, 0 or 1."""
+    """The reasons why noise terms are not those of a separable system, if the half of the
+    state with the number `momenta`, 0 or 1, holds the momenta. At most one for each term.
+    """
     positions = 1 - momenta
     faults = []
     for term, dependence in traced_noise:
-        # The change of q is linear in the increment. So it is zero if it does not depend on
-        # the increment.
+        # The change of q is linear in the increment of the noise, the control. So it is
+        # zero if it does not depend on the increment.
         may_move_q = _depends(dependence, positions, on="control")
         if may_move_q and not _keeps_half(term, positions, t0, y0, args):
-            cause = "dH_k/dp is not zero"
-            cause_if_plain = "a noise term changes q, the second half of the state"
+            in_hamiltonian = "dH_k/dp is not zero"
+            in_plain = "a noise term changes q, the second half of the state"
         elif _depends(dependence, momenta, on=momenta):
-            cause = "dH_k/dq depends on p"
-            cause_if_plain = "a noise term changes p by an amount that depends on p"
+            in_hamiltonian = "dH_k/dq depends on p"
+            in_plain = "a noise term changes p by an amount that depends on p"
         else:
             continue
-        cause = cause if is_hamiltonian(term) else cause_if_plain
+        cause = in_hamiltonian if is_hamiltonian(term) else in_plain
         faults.append(Fault(cause, _advice("separable", term)))
     return faults
 
@@ -301,6 +319,7 @@ def check_stratonovich(
     if not isinstance(solver, diffrax.AbstractItoSolver):
         return
     drift, noise = split_terms(terms)
+    # Only noise that is meant in the sense of Stratonovich is kept in `noise`.
     if all_terms:
         whose = "`expectation` takes all terms"
         instead = ", or use `monte_carlo`"
@@ -311,6 +330,8 @@ def check_stratonovich(
         noise = tuple(filter(is_hamiltonian, noise))
         whose = "The terms of `hamiltonian_terms` are"
         instead = ""
+    # Without a drift, `separable_fault` finds noise that is not of the form that changes
+    # only `p` and depends only on `q`.
     if additive_fault(noise, t0, y0, args) and separable_fault((), noise, t0, y0, args):
         raise ValueError(
             f"`{type(solver).__name__}` solves equations in the sense of Ito. {whose} in "
@@ -335,17 +356,18 @@ def _dependence(
 def _keeps_half(
     term: diffrax.AbstractTerm, half: int, t0: RealScalarLike, y0: Y, args: Args
 ) -> bool:
-    """Whether a plain noise term is known, while tracing, to leave one half of the state
-    unchanged. Then its matrix has zeros in the rows of this half.
+    """Whether a plain noise term is known, while tracing, to leave a half of the state, 0
+    or 1, unchanged: whether each of its noises changes the half by a known zero, as for a
+    constant matrix with zeros in the rows of this half.
 
-    Always false for Hamiltonian terms: what does not depend on one half of the state has no
-    derivative by it, so that `_dependence` shows that the other half does not change."""
+    Always false for Hamiltonian terms, for which `_dependence` is enough: a Hamiltonian
+    that does not depend on one half does not change the other half."""
     if is_hamiltonian(term):
         return False
     # Outside of this context the entries of a known matrix would be traced under `jit`.
     with at_trace_time():
         zeros, unravel = zeros_and_unravel(control_struct(term, t0))
-        # One noise at a time.
+        # The change of the half by each noise, for the increment 1 of this noise alone.
         changes = [
             unwrapped(term).vf_prod(t0, y0, args, unravel(unit))[half]
             for unit in jnp.eye(zeros.size, dtype=zeros.dtype)
@@ -386,8 +408,8 @@ def _wrong_assertion(
 
 
 def _advice(structure: AssertedStructure, term: diffrax.AbstractTerm) -> str:
-    """How to write a term so that tracing shows this structure, and what to do if it does
-    not have it."""
+    """What to do about a term that does not have this structure by tracing, in sentences:
+    how to write the term so that tracing shows the structure, or which solver to use."""
     is_drift = len(brownian_paths(term)) == 0
     if is_drift and not is_hamiltonian(term):
         return (
@@ -401,14 +423,12 @@ def _advice(structure: AssertedStructure, term: diffrax.AbstractTerm) -> str:
     }[structure]
     maker_name = name_of_maker(term)
     # The structure of plain noise, and of the noise of a bath, cannot be asserted.
-    if maker_name is None:
-        assertion = ""
-    else:
+    assertion = ""
+    if maker_name is not None:
         assertion = f', or pass `structure="{structure}"` to `{maker_name}`'
-    general = _GENERAL_BATH if maker_name == "langevin_terms" else _GENERAL
-    no_gradient = f" {_NO_GRADIENT}" if maker_name == "langevin_terms" else ""
+    otherwise = _GENERAL_BATH if maker_name == "langevin_terms" else f"{_GENERAL}."
     return (
         "Variables also count if they cancel, are multiplied by zero, are printed, or "
         f"share an array with others: in that case write {form}{assertion}. Otherwise "
-        f"{general}.{no_gradient}"
+        f"{otherwise}"
     )

@@ -22,11 +22,16 @@ def noises_commute(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
     vanish at some random states, for these `t0` and `args`. This is a test and not a proof.
     False if values are traced, or if no state can be tested.
 
-    The bracket is bilinear. So a single bracket, of two random linear combinations of the
-    noises, tests all pairs of noises.
+    `Db_l` is the derivative of the vector field `b_l` by the state. The bracket is
+    bilinear. So a single bracket, of two random linear combinations of the noises, tests
+    all pairs of noises. At each of a few random states, this function
+
+    1. computes the bracket of two random linear combinations;
+    2. compares its largest entry with the rounding errors of its two summands.
     """
     t0 = jnp.asarray(t0, jnp.result_type(float))
-    # A point: a state, and the coefficients of two linear combinations of the noises.
+    # A point holds a state, and the coefficients of two linear combinations of the noises,
+    # each in the structure of the controls that multiply the noises.
     coefficients = [control_struct(term, t0) for term in noise]
     point_struct = (jtu.tree_map(jnp.asarray, y0), coefficients, coefficients)
     zeros, unravel = zeros_and_unravel(point_struct)
@@ -55,11 +60,12 @@ def noises_commute(noise: Terms, t0: RealScalarLike, y0: Y, args: Args) -> bool:
         with jax.disable_jit(False):
             size_of_summand, size_of_bracket = sizes(points)
             # Points at which the sizes are not finite do not count.
-            counts = jnp.isfinite(size_of_summand) & jnp.isfinite(size_of_bracket)
-            # A bracket that is zero is computed as a rounding error of its summands.
+            is_finite = jnp.isfinite(size_of_summand) & jnp.isfinite(size_of_bracket)
+            # A bracket that is zero is computed as a rounding error of its two summands,
+            # which then have the same size.
             eps = jnp.finfo(size_of_summand.dtype).eps
             is_zero = size_of_bracket <= 1e3 * eps * size_of_summand
-            commute = jnp.any(counts) & jnp.all(is_zero | ~counts)
+            commute = jnp.any(is_finite) & jnp.all(is_zero | ~is_finite)
             # An error while the program runs is raised here at the latest.
             commute = jax.block_until_ready(commute)
     except RuntimeError:

@@ -23,6 +23,7 @@ from ..symplectic_gradients import Drift, hamiltonian_parts
 def check_drifts_differ(terms: PyTree[diffrax.AbstractTerm]) -> None:
     """Raises a `ValueError` if two drifts have the same Hamiltonian, which would count
     twice."""
+    # The Hamiltonians of the drifts so far.
     earlier: list[Any] = []
     for part in hamiltonian_parts(terms):
         H0 = part.H0 if isinstance(part, Drift) else None

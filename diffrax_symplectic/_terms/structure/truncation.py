@@ -33,10 +33,10 @@ def which_need_truncation(
     The noise of a bath needs none either, and truncation would cool the bath. With constant
     friction the noise is additive. With friction that depends on positions, an increment
     acts on the friction only through the positions, which it changes with the small factor
-    h."""
+    h, the step size."""
     noise = [term for term in flattened(terms) if len(brownian_paths(term)) > 0]
-    # For each path whether its own term depends on the state, in the order of
-    # `brownian_paths(terms)`.
+    # For each path, in the order of `brownian_paths(terms)`, whether its own term depends
+    # on the state. All paths of a term get the same flag.
     depends_on_state = []
     for term in noise:
         is_bath = isinstance(unwrapped(term), BathNoise)
