@@ -85,9 +85,9 @@ class SRKs4(AbstractSymplecticRungeKutta, AbstractImplicitStages):
 
     @property
     def tableau(self) -> AdditiveTableau:
-        # In the stages, I_k0 / h times one of these factors replaces the Brownian motion.
-        # I_k0 / h has the variance h / 3. Brownian motion has the variance h / 2 in the
-        # mean over the step. So the mean of both squared factors is 3 / 2.
+        # In the stages, `factor * I_k0 / h` replaces the Brownian motion, whose variance in
+        # the mean over the step is h / 2. I_k0 / h has the variance h / 3. So the mean of
+        # both squared factors is 3 / 2.
         first_factor = 1 + self.sign / np.sqrt(2)
         second_factor = 1 - self.sign / np.sqrt(2)
         # The coefficients of I_k and I_k0 / h in the formulas above.

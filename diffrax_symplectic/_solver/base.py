@@ -165,16 +165,14 @@ class AbstractSymplecticSolver(diffrax.AbstractStratonovichSolver[Outcome]):
         arguments = []
         for field in dataclasses.fields(self):
             value = getattr(self, field.name)
-            # For a traced value `tree_equal` is a traced boolean, which is not `True`: the
-            # value counts as different.
+            # For a traced value `tree_equal` returns a traced boolean, which is not `True`:
+            # the value counts as different.
             is_default = eqx.tree_equal(value, field.default) is True
             if field.repr and not is_default:
+                in_one_line = ft.partial(eqx.tree_pformat, width=1_000)
                 # `tree_pformat` would ignore the `__repr__` of a module, such as this one.
-                is_module = isinstance(value, eqx.Module)
-                text = (
-                    repr(value) if is_module else eqx.tree_pformat(value, width=1_000)
-                )
-                arguments.append(f"{field.name}={text}")
+                as_text = repr if isinstance(value, eqx.Module) else in_one_line
+                arguments.append(f"{field.name}={as_text(value)}")
         return f"{type(self).__name__}({', '.join(arguments)})"
 
     def check(self, terms, t0, y0: Y, args: Args) -> None:
@@ -262,7 +260,8 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
         # Brownian paths get the times as they are, `t0` and `t1`. If these are not batched,
         # what depends on times alone is computed once for the whole batch.
         by_noise = noise_changes(by_drift, h, noise, names, t0, t1, args, solver_name)
-        # Without drift terms no stage has the channel "h".
+        # For each channel of the plan, the change of the state as a function of time and
+        # state. Without drift terms no stage has the channel "h".
         changes = {"h": by_drift, **by_noise} if drift else by_noise
         y1, outcome = take_step(plan, Step(begin, h, changes), y0, self, solver_state)
         result = result_with_times_checked(terms, t0, t1, result_of(outcome, y1))
@@ -272,10 +271,12 @@ class AbstractSymplecticRungeKutta(AbstractSymplecticSolver):
 def _without_idle_stages(
     tableau: FlatTableau, drift: Terms, noise: Terms
 ) -> FlatTableau:
-    """The tableau without the stages that no term drives: an ODE has no noise, and there
-    may be no drift. Without a drift, its brackets with the noise are left out, too."""
+    """The tableau without the stages of the drift if there are no drift terms, and without
+    the stages of the noise if there are no noise terms. Without a drift, its brackets with
+    the noise are left out of the other stages."""
     driven_stages = []
     for i, stage in enumerate(tableau.stages):
+        # "h" is the channel of the drift.
         terms = drift if stage.channels == ("h",) else noise
         if len(terms) > 0:
             driven_stages.append(i)
@@ -293,7 +294,7 @@ def _variables(tableau: FlatTableau) -> list[str]:
     """The names of the random variables that drive the stages."""
     channels = [name for stage in tableau.stages for name in stage.channels]
     # A dictionary keeps each name once, in the order of the stages, while the order of a
-    # set would differ from run to run. "h" is the channel of the drift.
+    # set would differ from run to run.
     return [name for name in dict.fromkeys(channels) if name != "h"]
 
 

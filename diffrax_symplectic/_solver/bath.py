@@ -39,9 +39,15 @@ def check_friction(
     args: Args,
     solver_name: str,
 ) -> None:
-    """Raises a `ValueError` unless there is friction that is linear in the momenta, and a
-    drift beside it. `solver_name` is for messages. The check reads shapes, and what depends
-    on what, but no values, so it works under `jit`."""
+    """Raises a `ValueError`, with advice for users of the solver `solver_name`, unless
+
+    - the momenta are canonical, as those of `spin_terms` and `wave_terms` are not;
+    - there is friction, and a drift beside it;
+    - the friction is linear in the momenta, and not constant in them.
+
+    The check reads shapes, and what depends on what, but no values, so it works under
+    `jit`.
+    """
     if has_lifted(drift):
         raise ValueError(
             f"`{solver_name}` applies friction to a canonical momentum, which the state "
@@ -103,8 +109,8 @@ def after_friction(
     impulse: PyTree[Array],
 ) -> PyTree[Array]:
     r"""The momenta $p + x$ after friction and noise over the time `h`, by the implicit
-    midpoint rule: $x = h F(p + x / 2) + B W$, with the friction $F(p) = -G v(p)$, which is
-    linear in $p$, and the `impulse` $B W$ of the noise.
+    midpoint rule $x = h F(p + x / 2) + B W$. The force $F(p) = -G v(p)$ of the friction is
+    linear in $p$ up to a constant, and $B W$ is the `impulse` of the noise.
 
     This keeps the Maxwell distribution $\mathcal N(0, T M)$ for all $h$, $M$ and $G = B
     B^\top / (2 T)$. With the change $x$ as unknown, rounding errors are those of a small
@@ -116,11 +122,11 @@ def after_friction(
         friction_force, _ = rate(friction, t, (p, q), args)
         return friction_force
 
-    # F(p + x / 2) = F(p) + S x / 2, where S is the slope of F. So the equation for x is
-    # (1 - h S / 2) x = h F(p) + B W.
+    # F(p + x / 2) = F(p) + S x / 2, where the matrix S is the derivative, or slope, of F.
+    # So x solves the linear equation (1 - h S / 2) x = h F(p) + B W.
     if acts_elementwise(force, p):
-        # Each force depends on its own momentum alone. So S is diagonal, and the derivative
-        # along ones is its diagonal.
+        # Each force depends on its own momentum alone. So S is diagonal, the derivative
+        # along ones is its diagonal, and x is a quotient.
         ones = jtu.tree_map(jnp.ones_like, p)
         forces, slopes = jax.jvp(force, (p,), (ones,))
 
@@ -139,7 +145,10 @@ def after_friction(
     slope = jax.jacfwd(flat_force)(flat_p)
     rhs = step_size * flat_force(flat_p) + flat_impulse
     matrix = jnp.eye(flat_p.size, dtype=flat_p.dtype) - step_size / 2 * slope
-    # Elimination in XLA operations takes a tenth of LAPACK's time for small matrices.
+    # How to solve depends on the number of momenta:
+    # - for very few by elimination in XLA operations, in a tenth of LAPACK's time;
+    # - for many by modes, if the matrices of the friction are constant;
+    # - otherwise by LAPACK.
     solve = eliminate if flat_p.size <= MAX_WRITTEN_OUT else jnp.linalg.solve
     if flat_p.size > _MAX_SOLVED_IN_EACH_STEP:
         matrices = _matrices_if_constant(friction, t, y, args)
@@ -151,11 +160,12 @@ def after_friction(
 def _matrices_if_constant(
     friction: Terms, t: RealScalarLike, y: Y, args: Args
 ) -> tuple[Float[Array, "n n"], Float[Array, "n n"]] | None:
-    """The matrices G and M^-1 for momenta as a vector, or `None` unless they are known to
-    be the same at all times, momenta and positions.
+    """The matrices G and M^-1 of the friction force `-G v` with the velocities `v = M^-1
+    p`, for momenta as a vector; or `None` unless both matrices are known to be constant:
+    the same at all times, momenta and positions.
 
-    G is the friction on velocities. The inverse masses M^-1 are the derivative of the
-    velocities by the momenta. In a solve backward in time they are negated, as friction is.
+    In a solve backward in time M^-1 is negated, so that `-G M^-1` is the derivative of the
+    negated friction force.
     """
     if len(friction) != 1:
         return None
@@ -172,8 +182,8 @@ def _matrices_if_constant(
         def velocity(flat_p: Array) -> Array:
             return jfu.ravel_pytree(field.velocity(t, (unravel(flat_p), q), args))[0]
 
-        # The force is -G v. It is linear in v, so its derivative is the same at every
-        # vector of the right shape, such as `flat_p`.
+        # The force is linear in v, so its derivative is the same at every vector of the
+        # right shape, such as `flat_p`.
         minus_G = jax.jacfwd(force)(flat_p)
         return -minus_G, jax.jacfwd(velocity)(flat_p)
 
@@ -198,35 +208,33 @@ def _solve_by_modes(
     With $G = B B^\top$ these are the modes of the symmetric matrix $B^\top M^{-1} B$, with
     the eigenvectors $U$ and the eigenvalues $D$, the rates at which they are damped. For $L
     = B U$ and $R = L^\top M^{-1}$, $G M^{-1} = L R$ and $R L = D$. So by Woodbury's formula
-    the inverse of the matrix is $1 - \frac h2 L (1 + \frac h2 D)^{-1} R$. The change is
-    along the columns of $L$ only, so what the friction conserves is conserved.
+    the inverse of the matrix is $1 - \frac h2 L (1 + \frac h2 D)^{-1} R$: `R` maps to modes
+    and `L` back. Only the columns of `L` are added to `rhs`, so what the friction conserves
+    is conserved. The transposed inverse has `L^T` and `R^T` in place of `R` and `L`.
 
     The modes are the same in all steps, while `matrix` changes with the rounding errors of
-    `step_size`; derivatives are taken of the equation with `matrix`. The modes are computed
-    here, in the step: in the state of the solver a batch would copy them for each path. On
-    CPUs XLA moves their computation out of the loop over steps. On other devices it would
-    stay in the loop and take forty times as long as a solve, so these solve with `matrix`.
+    `step_size`. The modes are computed here, in the step: in the state of the solver a
+    batch would copy them for each path. On CPUs XLA moves their computation out of the loop
+    over steps. On other devices it would stay in the loop and take forty times as long as a
+    solve, so these solve with `matrix`.
     """
 
-    def by_modes(rhs: Array, transposed: bool = False) -> Array:
-        root = semidefinite_root(G)
-        rates, vectors = jnp.linalg.eigh(root.T @ inverse_masses @ root)
-        left = root @ vectors
-        right = left.T @ inverse_masses
-        to_modes = left.T if transposed else right
-        from_modes = right.T if transposed else left
-        in_modes = (to_modes @ rhs) / (1 + step_size / 2 * rates)
-        return rhs - step_size / 2 * (from_modes @ in_modes)
+    def solve(_: Any, b: Array, transposed: bool = False) -> Array:
+        def by_modes(rhs: Array) -> Array:
+            root = semidefinite_root(G)
+            rates, vectors = jnp.linalg.eigh(root.T @ inverse_masses @ root)
+            L = root @ vectors
+            R = L.T @ inverse_masses
+            to_modes = L.T if transposed else R
+            from_modes = R.T if transposed else L
+            in_modes = (to_modes @ rhs) / (1 + step_size / 2 * rates)
+            return rhs - step_size / 2 * (from_modes @ in_modes)
 
-    def solve(_: Any, rhs: Array) -> Array:
-        by_matrix = ft.partial(jnp.linalg.solve, matrix)
-        return lax.platform_dependent(rhs, cpu=by_modes, default=by_matrix)
+        by_matrix = ft.partial(jnp.linalg.solve, matrix.T if transposed else matrix)
+        return lax.platform_dependent(b, cpu=by_modes, default=by_matrix)
 
-    def solve_transposed(_: Any, rhs: Array) -> Array:
-        by_matrix = ft.partial(jnp.linalg.solve, matrix.T)
-        by_modes_transposed = ft.partial(by_modes, transposed=True)
-        return lax.platform_dependent(rhs, cpu=by_modes_transposed, default=by_matrix)
-
-    # This takes derivatives of the equation. Derivatives of eigenvectors may be infinite.
+    # This takes derivatives of the equation `multiply(x) = rhs`. Those of eigenvectors may
+    # be infinite.
     multiply = ft.partial(jnp.matmul, matrix)
+    solve_transposed = ft.partial(solve, transposed=True)
     return lax.custom_linear_solve(multiply, rhs, solve, solve_transposed)

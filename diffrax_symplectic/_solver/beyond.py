@@ -161,19 +161,15 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         # There is no state if the step is called by itself, or by `diffrax.HalfSolver`.
         outcome = no_failure() if solver_state is None else solver_state
         indices, increments = self._noises_in_order(terms, t0, t1)
-        # The flows, in their order: the drift moves to the middle of the step, the noises
-        # stay there, and the drift moves to the end. Padding adds the entries of the drift,
-        # which ignores the index and the increment of a noise.
+        # Each of these arrays has an entry for each flow: first the drift, which moves to
+        # the middle of the step, then the noises, which stay there, and last the drift,
+        # which moves to the end. Padding adds the entries of the drift, first and last. The
+        # drift ignores the index and the increment of a noise.
+        is_drift = np.pad(np.full(indices.size, False), 1, constant_values=True)
         middles = [t0 + (t1 - t0) / 2] * (indices.size + 1)
-        flows = (
-            # Whether it is the flow of the drift, not of one noise.
-            np.pad(np.full(indices.size, False), 1, constant_values=True),
-            # The times at its beginning and at its end.
-            jnp.stack([t0, *middles]),
-            jnp.stack([*middles, t1]),
-            jnp.pad(indices, 1),
-            jnp.pad(increments, 1),
-        )
+        begins = jnp.stack([t0, *middles])
+        ends = jnp.stack([*middles, t1])
+        flows = (is_drift, begins, ends, jnp.pad(indices, 1), jnp.pad(increments, 1))
 
         def after_drift(begin, end, index, increment, y, outcome):
             if len(drift) == 0:
@@ -201,7 +197,8 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         return y1, None, dict(y0=y0, y1=y1), outcome, result
 
     def _noises_in_order(self, terms, t0, t1) -> tuple[Array, Array]:
-        """The indices of the noises in the order of their flows, and their increments."""
+        """The indices of the noises in the order of their flows, which the coin chooses;
+        and their increments in the same order."""
         _, noise = split_terms(terms)
         if len(noise) == 0:
             return jnp.zeros(0, int), jnp.zeros(0)
@@ -209,7 +206,7 @@ class NinomiyaVictoir(AbstractSymplecticSolver, AbstractImplicitStages):
         # For several noises, a two-point variable is the coin that chooses their order.
         names = ["W", "two_point"] if num_noises > 1 else ["W"]
         variables = drawn_variables(noise, names, t0, t1, type(self).__name__)
-        # One increment for each noise, over all terms and leaves.
+        # One vector, with an increment for each noise of all terms.
         increments, _ = jfu.ravel_pytree(variables["W"])
         indices = jnp.arange(num_noises)
         if num_noises > 1:

@@ -38,8 +38,8 @@ def apply_brackets(
         return term.vf_prod(t, y, args, unravel(increments))
 
     def summand(A_l: Float[Array, " m"], unit: Float[Array, " m"]) -> Y:
-        """`Db_l (sum_k A_kl b_k)` for one `l`, from the column `A_l` of the matrix and the
-        unit vector of `l`."""
+        """`Db_l (sum_k A_kl b_k)` for one `l`, where `A_l` is the column `l` of the matrix,
+        and `unit` the unit vector that selects `b_l`."""
         b_l = ft.partial(field, unit)
         _, derivative = jax.jvp(b_l, (y,), (field(A_l, y),))
         return derivative
@@ -52,12 +52,15 @@ def apply_brackets(
 def bridge_coefficients(
     h: RealScalarLike, W: PyTree, H: PyTree, K: PyTree | None
 ) -> tuple[Float[Array, " m"], Float[Array, "m m"]]:
-    r"""$H_k$ and $L_{kl} / h$ of [`diffrax_symplectic.PlateauGauss`][] for `m` noises,
-    given the space-time areas, and space-time-time areas unless `K` is `None`.
+    r"""The coefficients $H_k$ and $L_{kl} / h$ of [`diffrax_symplectic.PlateauGauss`][] for
+    `m` noises, given their increments `W`, their space-time areas `H` and, unless it is
+    `None`, their space-time-time areas `K`.
 
-    A Brownian path is the line $u W$ with $u = s / h$ plus a bridge, which is
-    $6 u (1 - u) H + 120 u (1 - u) (\frac12 - u) K$ plus an independent remainder. The mean
-    square of the remainder, averaged over the step, is $h / 15$ without the summand of $K$,
+    Within a step, at the fraction $u$ of it, a Brownian path is the line $u W$ plus a
+    bridge, and the bridge is $6 u (1 - u) H + 120 u (1 - u) (\frac12 - u) K$ plus an
+    independent remainder. $L_{kl} / h$ is half of the average over $u$ of products of the
+    parts of the paths $k$ and $l$: bridge times bridge, and line times summand of $K$. The
+    mean square of the remainder, averaged over $u$, is $h / 15$ without the summand of $K$,
     and $3 h / 70$ with it.
     """
     W_k, _ = jfu.ravel_pytree(W)
@@ -65,16 +68,17 @@ def bridge_coefficients(
     # In a solve backward in time steps are negative, and the mean square is not.
     step_size = jnp.abs(h).astype(H_k.dtype)
     h_delta_kl = jnp.eye(H_k.size, dtype=H_k.dtype) * step_size
-    # Squares of parts of the bridge enter with half of their averages over the step. The
-    # square of the factor 6 u (1 - u) of H has the average 6 / 5, that of the factor of K
-    # 120 / 7. The product of the line u and the factor of K has the average -1.
-    L_kl = 3 / 5 * jnp.outer(H_k, H_k)
+    # The averages over u, of which half enters:
+    # - 6 / 5 for the square of the factor 6 u (1 - u) of H;
+    # - 120 / 7 for the square of the factor of K;
+    # - -1 for the product of u and the factor of K.
+    L_over_h = 3 / 5 * jnp.outer(H_k, H_k)
     if K is None:
-        return H_k, L_kl + h_delta_kl / 30
+        return H_k, L_over_h + h_delta_kl / 30
     K_k, _ = jfu.ravel_pytree(K)
     W_K = jnp.outer(W_k, K_k)
-    L_kl = L_kl + 60 / 7 * jnp.outer(K_k, K_k) - (W_K + W_K.T) / 2
-    return H_k, L_kl + 3 / 140 * h_delta_kl
+    L_over_h = L_over_h + 60 / 7 * jnp.outer(K_k, K_k) - (W_K + W_K.T) / 2
+    return H_k, L_over_h + 3 / 140 * h_delta_kl
 
 
 @eqx.filter_jit
@@ -87,24 +91,28 @@ def apply_bridge(
     t: RealScalarLike,
     y: Y,
 ) -> Y:
-    """`sum_k H_k [b_k, A] + sum_{k, l} L_kl [b_k, [b_l, A]]`, where `A(t, y) = drift(t, y)`
-    is the drift times `h`, and `[b, A] = A' b - b' A`. Time is treated as a component of
-    the state that the drift advances by `h`. The `coefficients` are `H_k` and `L_kl` of `m`
-    noises, for which `m` double brackets are computed."""
+    """`sum_k H_k [b_k, A] + sum_{k, l} L_kl [b_k, [b_l, A]]`, with the Lie brackets `[b, A]
+    = A' b - b' A` of the noises `b_k` and the drift times `h`, `A(t, y) = drift(t, y)`.
+    Time is treated as a component of the state that the drift advances by `h`. The
+    `coefficients` are `H_k` and the symmetric matrix `L_kl`, the second result of
+    `bridge_coefficients`.
+
+    Brackets are linear, so that for each `k` one outer bracket serves for all `l`. The
+    summand of `k` is `[sum_l L_kl b_l, [b_k, A]] + H_k [b_k, A]`."""
     _, unravel = zeros_and_unravel([control_struct(term) for term in noise])
     t = jnp.asarray(t, jnp.result_type(h))
     H, _ = coefficients
 
     def b(increments: Float[Array, " m"], t: Array, y: Y) -> Y:
-        """The change of the state by the noise with these increments."""
+        """The noise `sum_k increments[k] b_k`."""
         pairs = zip(noise, unravel(increments))
         return tree_sum([term.vf_prod(t, y, args, control) for term, control in pairs])
 
     def bracket_and_field(
         increments: Float[Array, " m"], field: Callable, t: Array, y: Y, speed: Array
     ) -> tuple[Y, Y]:
-        """The bracket `[b, field]` of the noise `b` with these increments, and the value of
-        `field`, a vector field that advances time by `speed`."""
+        """The bracket `[b, field] = field' b - b' field` of the noise `b` with these
+        increments and a vector field that advances time by `speed`; and `field(t, y)`."""
         noise_value = b(increments, t, y)
         value, change_of_field = jax.jvp(lambda y: field(t, y), (y,), (noise_value,))
         b_of_increments = ft.partial(b, increments)
@@ -117,8 +125,7 @@ def apply_bridge(
         return bracket
 
     def summand(unit: Float[Array, " m"], H_k: Array, L_k: Float[Array, " m"]) -> Y:
-        """`[sum_l L_kl b_l, [b_k, A]] + H_k [b_k, A]` for one `k`: by linearity one outer
-        bracket serves for all `l`."""
+        """The summand of the noise `k` of this unit vector, with the row `L_k`."""
         inner = ft.partial(drift_bracket, unit)
         # The drift advances time at a constant speed, and the noise does not advance it. So
         # their bracket has no component along time.

@@ -24,9 +24,11 @@ def init_constrained(
     y0: Y,
     args: Args,
 ) -> optx.RESULTS:
-    """Whether a path can start at `y0`, as the state of the solver. Raises a `ValueError`
-    for terms that the solver does not take, and for a start off the surface; if `y0` is
-    traced, that is an error when run, or under `vmap` a failure of this path alone."""
+    """The outcome before the first step, which is a failure if the path cannot start at
+    `y0`. Raises a `ValueError` for terms that the solver does not take.
+
+    A start off the surface of the constraint raises a `ValueError`, too. If `y0` is traced,
+    it is an error when run, or under `vmap` a failure of this path alone."""
     check_pair(y0)
     solver.check(without_constraint(terms), t0, y0, args)
     is_dependent, is_off = check_start(terms, t0, y0, args)
@@ -39,9 +41,10 @@ def init_constrained(
 def end_on_surface(
     moving: Moving, surface: Surface, last_outcome: optx.RESULTS
 ) -> tuple[Y, optx.RESULTS]:
-    """The state at the end of a constrained step, after its last piece; and the outcome of
-    all steps so far, which is a failure if multipliers were not found or a flow failed.
-    `last_outcome` is the outcome of all steps before."""
+    """The state at the end of a constrained step, whose last piece ended at `moving`, with
+    momenta made tangent to the surface; and the outcome of all steps so far. A step fails
+    if multipliers were not found or a flow failed. `last_outcome` is the outcome of all
+    steps before."""
     found = moving.found
     for flow_result in moving.results.values():
         found = found & (flow_result == diffrax.RESULTS.successful)
@@ -51,8 +54,8 @@ def end_on_surface(
     # The first failure is the one that is reported.
     outcome = R.where(last_outcome == R.successful, outcome, last_outcome)
 
-    # Without a solution there is no derivative. It is set to zero, so that a failed path
-    # does not spoil gradients that are summed over a batch.
+    # A failed path has no derivative. It is set to zero, so that this path does not spoil
+    # gradients that are summed over a batch.
     def fixed_if_failed(x: Array) -> Array:
         return jnp.where(outcome == R.successful, x, lax.stop_gradient(x))
 

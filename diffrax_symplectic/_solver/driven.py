@@ -49,10 +49,12 @@ def noise_changes(
 ) -> dict[str, jtu.Partial]:
     """For each name of a random variable, a function of `(t, y)`: the change of the state
     over the step from `t0` to `t1`, of size `h`, by the vector fields that the variable
-    multiplies, evaluated at this time and state. `drift` is what `drift_change` returns:
-    some variables multiply its brackets with the noise."""
-    # Most variables are attributes of an increment. The coefficients of brackets with the
-    # drift are not: they are functions of `W`, `H` and, if the increment has it, `K`.
+    multiplies, evaluated at this time and state.
+
+    A variable multiplies the noise itself, the Lie brackets of noises, or the Lie brackets
+    of the noise with the drift. For the last, `drift` is what `drift_change` returns."""
+    # Most variables are attributes of an increment, and drawn. The coefficients of brackets
+    # with the drift are functions of the drawn `W`, `H` and, if increments have it, `K`.
     drawn = [name for name in names if drives(name) != "drift brackets"]
     optional = []
     if len(drawn) < len(names):
@@ -96,7 +98,7 @@ def drawn_variables(
 
     Raises a `ValueError`, which quotes `solver_name`, if a path lacks one of `names`.
     """
-    t1 = _with_resolution_checked(noise, t0, t1)
+    t1 = _checked_end_of_step(noise, t0, t1)
     # Without Lévy areas an increment is `W` itself.
     only_increments = names == ["W"]
     options = {} if only_increments else {"use_levy": True}
@@ -120,8 +122,8 @@ def drawn_variables(
     for name in [*names, *filter(all_have, optional)]:
         values = [getattr(increment, name) for increment in increments]
         if name in VARIABLES and VARIABLES[name].even:
-            # In a solve backward in time Diffrax negates all variables. Even variables must
-            # keep their sign.
+            # In a solve backward in time Diffrax negates all variables. An even variable is
+            # the same for a path that is reversed in time, and must keep its sign.
             pairs = zip(noise, values)
             values = [(direction(term) * value**ω).ω for term, value in pairs]
         variables[name] = values
@@ -148,10 +150,11 @@ def _how_to_get(missing: list[str], noise: Terms) -> str:
     return variable.advice
 
 
-def _with_resolution_checked(
+def _checked_end_of_step(
     noise: Terms, t0: RealScalarLike, t1: RealScalarLike
 ) -> RealScalarLike:
-    """`t1`, with an error when run if a `VirtualBrownianTree` does not resolve the step."""
+    """Returns `t1`, the end of the step from `t0`. If a `VirtualBrownianTree` among the
+    paths of the noise does not resolve the step, `t1` raises an error when it is used."""
     step_size = jnp.abs(t1 - t0)
     for path in brownian_paths(noise):
         while isinstance(path, AbstractWrappedPath):

@@ -176,8 +176,8 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
 
     def step(self, terms, t0, t1, y0, args, solver_state: Any, made_jump) -> Any:
         del made_jump
-        # These are the state of the solver for the rest, and whether the flow returned NaN
-        # at the start of the solve.
+        # The state of the solver for the rest, and whether the flow returned NaN at the
+        # start of the solve.
         inner_state, is_broken = solver_state
         # Steps are positive even in a solve backward in time, where the flow runs back.
         half = direction(terms) * (t1 - t0) / 2

@@ -54,6 +54,7 @@ def check_returns_pair(
 ) -> None:
     """Raises a `ValueError` if a flow returns a state of another structure, shape or dtype
     than it gets."""
+    # `t0` stands for a duration: only shapes and dtypes are computed.
     time = jnp.asarray(t0, jnp.result_type(t0, jnp.float32))
     y1 = eqx.filter_eval_shape(flow, time, y0, args)
     if _structure_of(y1) != _structure_of(y0):
@@ -73,8 +74,8 @@ def returns_nan(
     flow: FlowFunction, time: RealScalarLike, y0: Y, args: Args
 ) -> Bool[Array, ""]:
     """Whether a flow returns NaN after `time`, half of the first step, from the start `y0`
-    of a solve. If it does, that is an error, except under `vmap`: there the caller makes
-    this path fail, without the others of its batch."""
+    of a solve. NaN is an error, except under `vmap`: there the caller makes the path of
+    this `y0` fail, and the others of its batch continue."""
     # The check has no derivative.
     y1 = jtu.tree_map(lax.stop_gradient, flow(time, y0, args))
     leaf_has_nan = jnp.stack([jnp.any(jnp.isnan(x)) for x in jtu.tree_leaves(y1)])

@@ -99,6 +99,7 @@ def linear_flow(
     **Source:** [Korol, Rosa-Raíces, Bou-Rabee and Miller
     (2020)](https://doi.org/10.1063/1.5134810), for ring polymers.
     """
+    # The modes follow from a stiffness. Without one all three arguments are needed.
     num_given = sum(x is not None for x in (frequencies, to_modes, from_modes))
     num_needed = 3 if stiffness is None else 0
     if num_given != num_needed:
@@ -113,6 +114,8 @@ def linear_flow(
         to_modes = jtu.Partial(_to_modes, vectors)
         from_modes = jtu.Partial(_from_modes, vectors)
     else:
+        # The flow applies `to_modes` to scaled positions, `sqrt(masses) * q`. Their modes
+        # are the given ones, those of `q`, only if all masses are equal.
         if jnp.ndim(mass_roots) > 0:
             raise ValueError("With modes that are given, `masses` must be one number.")
         omega = jnp.asarray(frequencies, float)
@@ -123,13 +126,13 @@ def linear_flow(
 def _modes_of(
     stiffness: ArrayLike, mass_roots: Float[Array, "..."]
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """The modes of a stiffness `K`, from the matrix `A = M^-1/2 K M^-1/2`, where
-    `mass_roots` is `M^1/2`, one number or in the shape of `q`.
+    """The frequencies and modes of a system with the stiffness `K` and the masses `M`, of
+    which `mass_roots` is `M^1/2`, one number or in the shape of `q`.
 
-    Returns the frequencies, which are the roots of the eigenvalues of `A`; and the
-    eigenvectors of `A` as columns, which are the modes of the scaled positions `M^1/2 q`.
-    They are computed by NumPy if all values are known, so that wrong ones raise a
-    `ValueError`.
+    They follow from the matrix `A = M^-1/2 K M^-1/2`. The frequencies are the roots of its
+    eigenvalues. The modes are its eigenvectors, returned as columns, for the scaled
+    positions `M^1/2 q`. All is computed by NumPy if all values are known, so that wrong
+    ones raise a `ValueError`.
     """
     K: Any = stiffness if is_traced(stiffness) else np.asarray(stiffness, float)
     shape = np.shape(K)
@@ -151,10 +154,10 @@ def _modes_of(
             )
     # One root of a mass for each component of `q`.
     mass_roots_of_q = xp.broadcast_to(xp.asarray(mass_roots), shape_of_q).reshape(-1)
+    A = K / mass_roots_of_q[:, None] / mass_roots_of_q
     # The eigenvalues are the squares of the frequencies.
-    eigenvalues, vectors = xp.linalg.eigh(
-        K / mass_roots_of_q[:, None] / mass_roots_of_q
-    )
+    eigenvalues, vectors = xp.linalg.eigh(A)
+    # An eigenvalue below this is zero, up to rounding errors.
     rounding = _TOLERANCE * xp.max(abs(eigenvalues), initial=0)
     least = xp.min(eigenvalues, initial=0)
     if is_known and least < -rounding:
@@ -200,8 +203,11 @@ class CayleyFlow(eqx.Module):
     ) -> tuple[Array, Array]:
         """The state after `time`, half of a step.
 
-        In a mode with the scaled positions `Q = sqrt(m) q` and momenta `P = p / sqrt(m)`,
-        `dP/dt = -omega^2 Q` and `dQ/dt = P`. It turns by the angle `arctan(omega time)`.
+        Modes have the scaled positions `Q = sqrt(m) q` and momenta `P = p / sqrt(m)`, with
+        `dP/dt = -omega^2 Q` and `dQ/dt = P`. So `(P, omega Q)` turns by an angle, here
+        `a = arctan(omega time)`:
+
+            P1 = cos(a) P - omega sin(a) Q,    Q1 = cos(a) Q + sin(a) / omega P
         """
         del args
         check_pair(y)
@@ -211,9 +217,9 @@ class CayleyFlow(eqx.Module):
         rest = self.rest.astype(dtype)
         omega = self.frequencies.astype(dtype)
         time = jnp.asarray(time, dtype)
-        # The tangent of the angle is `omega time`, and the sine is the product of tangent
-        # and cosine. The sine divided by omega is computed without a division, which makes
-        # it right for a frequency of zero, too.
+        # With `tan(a) = omega time`, `cos(a)` is `1 / sqrt(1 + tan(a)^2)`, and `sin(a) /
+        # omega` is `tan(a) cos(a) / omega = time cos(a)`, without a division by a frequency
+        # of zero.
         cosine = 1 / jnp.sqrt(1 + (omega * time) ** 2)
         sine_over_omega = time * cosine
         P = self.to_modes(p / mass_roots)

@@ -40,9 +40,10 @@ def common_path(
 ) -> diffrax.AbstractBrownianPath:
     """A Gaussian path with the Lévy areas that the solver needs.
 
-    With a `cell`, a time of which all steps are multiples, the path is the same Brownian
-    motion for all solvers. If `cell` is an array, another value of it compiles nothing
-    anew, except for solvers that need Lévy areas of pairs of noises."""
+    With a `cell`, a length of time of which all steps are multiples, the path is the same
+    Brownian motion for all solvers and all such steps. If `cell` is an array, another value
+    of it compiles nothing anew, except for solvers that need Lévy areas of pairs of noises.
+    """
     if isinstance(cell, np.ndarray):
         path = CommonBrownianPath(shape, key, cell)  # pyright: ignore
     else:

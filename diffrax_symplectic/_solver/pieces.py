@@ -1,7 +1,8 @@
 """The pieces of a splitting: each moves momenta or positions, for a share of the step.
 
 A step passes a `Moving`, which holds the state, from piece to piece. What stays the same
-for all pieces of the step is in a `Setting`.
+for all pieces of the step is in a `Setting`. The `share` of a piece is the fraction of the
+step over which it moves.
 """
 
 import abc
@@ -48,10 +49,10 @@ from .step import result_of
 class Setting(NamedTuple):
     """What all pieces of a step have in common.
 
-    - `kicks`: the terms whose forces are the kicks.
+    - `kicks`: the terms whose forces move the momenta in kicks.
     - `rest`: the terms that free flight or flows follow.
-    - `friction`, `noise`: the terms of the baths. Without friction there is one kick and no
-        bath, and the noise acts in the kick.
+    - `friction`, `noise`: the terms that act in baths. Without friction there is one kick
+        and no bath, and the noise acts in the kick.
     - `args`: as for `diffrax.diffeqsolve`.
     - `length`, `time`: functions of a share `s` of the step, such as 0.5: the length `s h`
         of this share, and the time `t0 + s h` after it.
@@ -84,13 +85,22 @@ def kicks_and_rest(has_flow: bool, drift: Terms) -> tuple[Terms, Terms]:
     return slow, rest
 
 
-def setting_of(terms, t0, t1, y0: Y, args: Args, has_flow: bool) -> Setting:
-    """The setting of a step from `y0 = (p, q)`, without `increments` and `pending`."""
+def setting_of(
+    terms: PyTree[diffrax.AbstractTerm],
+    t0: RealScalarLike,
+    t1: RealScalarLike,
+    y0: Y,
+    args: Args,
+    has_flow: bool,
+) -> Setting:
+    """The setting of the step from `t0` to `t1` and from `y0 = (p, q)`: the terms sorted by
+    the pieces that follow them, the times, and the surface of the constraint. `increments`
+    and `pending` keep their defaults."""
     drift, friction, noise = split_friction(without_constraint(terms))
     kicks, rest = kicks_and_rest(has_flow, drift)
     h = t1 - t0
 
-    # Equal shares get the same array, which is computed once.
+    # `share` is a share of the step. Equal shares get the same array, computed once.
     @ft.cache
     def length(share: float) -> RealScalarLike:
         return h if share == 1 else share * h
@@ -99,19 +109,28 @@ def setting_of(terms, t0, t1, y0: Y, args: Args, has_flow: bool) -> Setting:
     def time(share: float) -> RealScalarLike:
         if share == 0:
             return t0
-        # The rounding of `t0 + h` may differ from `t1`.
+        # With rounding errors `t0 + h` may differ from `t1`.
         return t1 if share == 1 else t0 + length(share)
 
     surface = None
     constraint = constraint_of(terms)
     if constraint is not None:
         surface = Surface.of(terms, t0, y0, args)
-        # A flow that is a solver gets only the terms in `rest`, so that one of these has to
-        # carry the constraint.
+        # A flow that is a solver gets only the terms in `rest`, and finds the constraint if
+        # any one of them carries it. There is always a first one.
         first, *others = rest
         first = wrapped_like(first, with_constraint(unwrapped(first), constraint))
         rest = (first, *others)
-    return Setting(kicks, rest, friction, noise, args, length, time, surface)
+    return Setting(
+        kicks=kicks,
+        rest=rest,
+        friction=friction,
+        noise=noise,
+        args=args,
+        length=length,
+        time=time,
+        surface=surface,
+    )
 
 
 class Moving(NamedTuple):
@@ -119,9 +138,10 @@ class Moving(NamedTuple):
 
     - `y`: the momenta and positions.
     - `forces`: the forces of the kicks at `y`, if they are known.
-    - `flows`: the state of each flow, by the number of its first piece. For a solver it is
-        the solver state, for a function whether it returned NaN at the start of the solve.
-    - `results`: the last result of each flow that has moved, by the same numbers. Earlier
+    - `flows`: the state of each flow. Flows that are alike share one state: its key is the
+        number of the first piece with this flow. For a solver it is the solver state, for a
+        function whether it returned NaN at the start of the solve.
+    - `results`: the last result of each flow that has moved, by the same keys. Earlier
         results are not needed: after a failure all results of the flow are failures.
     - `elapsed`: the share of the step for which positions have moved.
     - `num_baths`: how many baths have acted.
@@ -183,8 +203,8 @@ class AbstractPiece(eqx.Module):
 
     @abc.abstractmethod
     def move(self, setting: Setting, moving: Moving, number: int) -> Moving:
-        """The state after this piece. `number` is the number of the first piece that is
-        alike, by which `moving` holds the state of a flow.
+        """The state after this piece. `number` is the number of the first piece of the
+        splitting that is like this one: the key of the state of a flow in `moving.flows`.
 
         Lengths in `setting` are positive in a solve backward in time, too. `rate` and
         `apply` take the direction of time from the terms; any other motion multiplies its
@@ -298,11 +318,13 @@ class Flow(AbstractPiece):
         else:
             check_returns_pair(self.flow, t0, y0, args)  # pyright: ignore
 
-    def begin(self, setting: Setting, t0, t1, y0: Y) -> PyTree[Array]:
-        """The state of the flow at the start of a solve, whose first step is from `t0` to
-        `t1`: of a solver its state, of a function whether it returns NaN for `y0`."""
+    def begin(self, setting: Setting, y0: Y) -> PyTree[Array]:
+        """The state of the flow at the start `y0` of a solve, from the setting of its first
+        step: of a solver its state, of a function whether it returns NaN for `y0`."""
         if is_solver(self.flow):
             terms = diffrax.MultiTerm(*setting.rest)
+            t0 = setting.time(0.0)
+            t1 = setting.time(1.0)
             return self.flow.init(terms, t0, t1, y0, setting.args)  # pyright: ignore
         # Steps are positive even in a solve backward in time, where the flow runs back.
         time = direction(setting.rest) * setting.length(self.share)
@@ -316,8 +338,8 @@ class Flow(AbstractPiece):
             time = direction(setting.rest) * setting.length(self.share)
             y = self.flow(time, moving.y, setting.args)  # pyright: ignore
             R: Any = diffrax.RESULTS
-            # The state of a function is whether it returned NaN at the start of the solve.
-            result = R.where(state, R.nonfinite, result_of(None, y))
+            returned_nan_at_start = state
+            result = R.where(returned_nan_at_start, R.nonfinite, result_of(None, y))
         return moving.after_move(
             y,
             self.share,
@@ -328,8 +350,9 @@ class Flow(AbstractPiece):
     def _after_steps(
         self, setting: Setting, moving: Moving, state: PyTree[Array]
     ) -> tuple[Y, PyTree[Array], diffrax.RESULTS]:
-        """`y`, the solver state and the result after all steps of a flow that is a solver,
-        from the solver state before."""
+        """`y`, the solver state and the result after the `steps` of a flow that is a
+        solver. They divide its share of the step into equal parts. `state` is the solver
+        state before the first of them."""
         solver: Any = self.flow
         terms = diffrax.MultiTerm(*setting.rest)
         t0 = setting.time(moving.elapsed)
@@ -339,8 +362,8 @@ class Flow(AbstractPiece):
         def step(carry: tuple[Any, ...], index: Any) -> tuple[tuple[Any, ...], None]:
             y, state, _ = carry
             start = t0 + index * h
-            # For a solver that remembers the end of its last step, the change of the state
-            # by a bath since then is a jump.
+            # A solver may reuse what it computed at the end of its last step. Since then
+            # other pieces, such as a bath, have changed the state.
             made_jump = True
             y, _, _, state, result = solver.step(
                 terms, start, start + h, y, setting.args, state, made_jump
@@ -392,6 +415,7 @@ class Bath(AbstractPiece):
             noise_impulse, _ = apply(setting.noise, increments, setting.args, time, y)
         else:
             noise_impulse = jtu.tree_map(jnp.zeros_like, p)
+        # A function of an impulse: the momenta after friction and this impulse.
         after_impulse = ft.partial(
             after_friction, setting.friction, time, length, y, setting.args
         )
@@ -410,22 +434,22 @@ def _tangent_after_friction(
     surface: Surface,
     normal_space: NormalSpace,
 ) -> PyTree[Array]:
-    """The momenta after friction and noise, tangent to the surface of a constraint.
-    `after_impulse(x)` are the momenta after friction and the impulse `x`, in which it is
-    linear up to a constant.
+    """The momenta after friction and noise, made tangent to the surface of a constraint by
+    impulses of the constraint forces, along its normals.
 
-    The constraint forces give impulses along the normals. Friction acts on them as on the
-    impulse of the noise: then friction and noise are the midpoint rule within the tangent
-    space, which keeps its Maxwell distribution.
+    `after_impulse(x)` are the momenta after friction and the impulse `x`: a function that
+    is linear in `x`, up to a constant. Friction acts on the impulses of the constraint
+    forces as on the impulse of the noise. Then friction and noise are the midpoint rule
+    within the tangent space, which keeps its Maxwell distribution.
     """
     flat_noise_impulse, unravel = jfu.ravel_pytree(noise_impulse)
 
     def flat_after_impulse(impulse: Array) -> Array:
         return jfu.ravel_pytree(after_impulse(unravel(impulse)))[0]
 
-    def response(normal: Array) -> Array:
-        """The change of the momenta by a unit impulse along this normal."""
-        _, change_of_p = jax.jvp(flat_after_impulse, (flat_noise_impulse,), (normal,))
+    def response(impulse: Array) -> Array:
+        """The change of the momenta, with friction, by an impulse along a normal."""
+        _, change_of_p = jax.jvp(flat_after_impulse, (flat_noise_impulse,), (impulse,))
         return change_of_p
 
     flat_p = flat_after_impulse(flat_noise_impulse)
@@ -435,18 +459,18 @@ def _tangent_after_friction(
 def first_alike(pieces: tuple[AbstractPiece, ...]) -> tuple[int, ...]:
     """For each piece the number of the first piece that is alike, which is its own number
     if none before it is alike. Flows that are alike share one state, kept by this number.
+
     Pieces are alike if they have the same class, and their static fields are equal and all
     other fields the same object."""
 
-    def are_alike(one: AbstractPiece, other: AbstractPiece) -> bool:
-        if type(one) is not type(other):
-            return False
-        for field in dataclasses.fields(one):
-            value = getattr(one, field.name)
-            other_value = getattr(other, field.name)
+    def identity(piece: AbstractPiece) -> list[Any]:
+        """A list that is equal for pieces that are alike."""
+        values: list[Any] = [type(piece)]
+        for field in dataclasses.fields(piece):
+            value = getattr(piece, field.name)
             is_static = field.metadata.get("static", False)
-            if not (value == other_value if is_static else value is other_value):
-                return False
-        return True
+            values.append(value if is_static else id(value))
+        return values
 
-    return tuple([are_alike(x, piece) for x in pieces].index(True) for piece in pieces)
+    identities = [identity(piece) for piece in pieces]
+    return tuple(identities.index(x) for x in identities)

@@ -50,8 +50,7 @@ class Record(NamedTuple):
         `right_energy_unresolved` and `most_friction`, in sentences for users."""
         sentences = [self.choose]
         if self.most_frequency is not None:
-            limit = f"{self.most_frequency:g}"
-            sentences.append(f"Not for long steps, omega h > {limit}.")
+            sentences.append(f"Not for long steps, omega h > {self.most_frequency:g}.")
         # If stationary momenta are exact, a heat bath corrects the energy.
         if self.right_energy_unresolved is False and "pp" in self.stationary:
             sentences.append("If noise drives stiff modes, only in a heat bath.")

@@ -243,8 +243,10 @@ class StormerVerlet(AbstractSymplecticRungeKutta):
         if setting.noise:
             name = type(self).__name__
             increments = drawn_variables(setting.noise, ["W"], t0, t1, name)["W"]
-        # Multipliers are not sought for a path that failed before: others would wait.
+        # Multipliers are not sought for a path that failed before: others of its batch
+        # would wait for it.
         pending = solver_state == optx.RESULTS.successful
+        # The list has one entry, for the one kick.
         setting = setting._replace(increments=[increments], pending=pending)
         moving = Moving(y0, forces=None, flows={})
         for number, piece in enumerate(_CONSTRAINED_STEP):

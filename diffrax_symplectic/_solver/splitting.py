@@ -50,11 +50,11 @@ else:
 
 
 class SplittingState(NamedTuple):
-    """What a splitting hands on from the end of a step to the start of the next one.
+    """The solver state: what a splitting hands on from step to step.
 
     - `forces`: the forces of the last kick if they serve for the first kick of the next
         step, else `None`.
-    - `flows`: the states of the flows, as in `Moving`.
+    - `flows`: the state of each flow, by the number of its first piece, as in `Moving`.
     - `outcome`: with a constraint, whether its multipliers were found in all steps so far;
         otherwise `None`.
     """
@@ -70,7 +70,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
     pieces: AbstractVar[tuple[AbstractPiece, ...]]
 
     def _first_alike(self) -> tuple[int, ...]:
-        """What `first_alike` returns for the pieces."""
+        """For each piece the number of the first piece that is alike."""
         return first_alike(self.pieces)
 
     @property
@@ -141,6 +141,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         terms, y0 = momentum_first(terms, y0)
         drift, friction, noise = split_friction(terms)
         kicks, rest = kicks_and_rest(self.has_flow, drift)
+        # Only the kicks must be separable. A flow checks the terms that it follows, below.
         check_structure("separable", kicks, noise, t0, y0, args, solver_name)
         if not all(isinstance(unwrapped(term), diffrax.ODETerm) for term in drift):
             raise ValueError(
@@ -152,24 +153,21 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
             piece.check_follows(rest, t0, y0, args)
 
     def init(self, terms, t0, t1, y0, args) -> Any:
-        """Checks the arguments, and makes the state with which the first step begins."""
+        """Checks the arguments, and makes the `SplittingState` for the first step."""
         outcome = self._outcome_at_start(terms, t0, y0, args)
         terms, y0 = momentum_first(terms, y0)
         setting = setting_of(terms, t0, t1, y0, args, self.has_flow)
         forces = None
         if self.kicks_at_ends and setting.kicks:
             forces, _ = rate(setting.kicks, t0, y0, args)
-        flows = {
-            number: flow.begin(setting, t0, t1, y0)
-            for number, flow in self._flows.items()
-        }
+        flows = {i: flow.begin(setting, y0) for i, flow in self._flows.items()}
         return SplittingState(forces, flows, outcome)
 
     def _outcome_at_start(self, terms, t0, y0: Y, args: Args) -> Outcome:
         """The `outcome` of a `SplittingState` before the first step. Raises a `ValueError`
         unless the state and the terms suit the solver."""
         if constraint_of(terms) is None or not self.keeps_constraints:
-            # This refuses a constraint that the solver does not keep.
+            # `check` refuses a constraint that the solver does not keep.
             self.check(terms, t0, y0, args)
             return None
         for piece in self._flows.values():
@@ -181,8 +179,8 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         return init_constrained(self, terms, t0, y0, args)
 
     def _increments(self, noise: Terms, t0, t1) -> list[list]:
-        """For each bath the increments of all noise terms in its share of the step. Empty
-        without noise."""
+        """For each bath the increments of all noise terms in its share of the step. Without
+        noise the list is empty."""
         if len(noise) == 0:
             return []
         names = list(self.variables)
@@ -210,7 +208,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
         setting = setting._replace(increments=increments)
         if setting.surface is not None:
             setting = setting._replace(pending=outcome == optx.RESULTS.successful)
-        # `forces` are those at the end of the last step. The state may have jumped since.
+        # `forces` are known from the end of the last step. The state may have jumped since.
         if forces is not None and made_jump is not False:
             forces = _forces_after_jump(setting, forces, made_jump, t0, start)
         moving = Moving(start, forces, flows)
@@ -220,6 +218,7 @@ class AbstractLangevinSplitting(AbstractSymplecticSolver):
             end = moving.y
             result = result_of(None, end)
             R: Any = diffrax.RESULTS
+            # A flow that failed gives the step its own result.
             for flow_result in moving.results.values():
                 result = R.where(flow_result == R.successful, result, flow_result)
         else:

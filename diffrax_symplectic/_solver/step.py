@@ -4,6 +4,9 @@ The plan orders the stages in blocks. A block has unknown stages, whose values k
 stage equations k = Phi(k), and explicit stages, which are evaluated from values that are
 known already. A root finder solves the stage equations; derivatives of a step follow from
 the equations by the implicit function theorem, not from the iterations.
+
+Stages that evaluate the same vector fields may form a group: they are evaluated together,
+with their values stacked along a new first axis.
 """
 
 import functools as ft
@@ -27,15 +30,16 @@ from .._tableau import Block, Group, Stage, StepPlan
 from .._terms import tree_sum
 
 
-# The value of a stage: the change of the part of the state that it writes. The values of
-# several stages that are evaluated together are stacked along a first axis.
+# The value of a stage, or the stacked values of a group: the change of the part of the
+# state that the stage writes, which is the whole state or one half of a pair `(p, q)`.
 _Value: TypeAlias = PyTree[Array]
 # The values of the stages known so far, by stage number.
 KnownValues: TypeAlias = dict[int, _Value]
 # The values of the unknown stages, by group. Comments and root finders call them k.
 Unknown: TypeAlias = dict[Group, _Value]
-# The change of the state by one channel over the whole step, its vector field times its
-# control, as a function of time and state.
+# The change of the state by one channel over the whole step, as a function of time and
+# state. A channel is the drift, or one random variable with the vector field that it
+# drives.
 Change: TypeAlias = Callable[[RealScalarLike, Y], Y]
 # Whether the stage equations of all steps so far were solved: success, or the first
 # failure. `None` for a solver without stage equations.
@@ -62,18 +66,18 @@ class Stages(eqx.Module):
     step: Step
     y0: Y
     # Whether sweeps, the fixed-point iterations of a root finder, may update momenta and
-    # positions one after the other.
+    # positions one after the other. It matters only for values that are pairs `(p, q)`.
     in_halves: bool = eqx.field(static=True, default=True)
 
     def _start(self, group: Group) -> PyTree[Array]:
-        """The part of `y0` that the stages of a group change."""
+        """The part of `y0` that the stages of a group write."""
         return _part(self.y0, self.plan.tableau.stages[group[0]].writes)
 
     def zeros(self) -> Unknown:
-        """Zeros for the unknown values, as a guess."""
+        """The guess of the root finder: zeros in the shapes of all unknown values."""
 
         def zeros_for(group: Group) -> _Value:
-            # The value of one stage alone is not stacked.
+            # The value of a group of one stage is not stacked.
             stacked_axis = (len(group),) if len(group) > 1 else ()
 
             def stacked_zeros(x: Array) -> Array:
@@ -85,11 +89,12 @@ class Stages(eqx.Module):
         return {group: zeros_for(group) for group in groups}
 
     def scale(self, unknown: Unknown) -> Unknown:
-        """The size of the state that unknown values change, which sets their tolerance."""
+        """For each unknown value `k`, which moves the part `y` of the state, the size `|y|
+        + |k|`. The root finder's tolerance for `k` is relative to this size."""
 
         def size(y: Array, value: Array) -> Array:
-            # The value is added because the state may be zero. The state broadcasts against
-            # the stacked values of several stages.
+            # `|k|` is added because the state may be zero. The state broadcasts against the
+            # stacked values of a group.
             return jnp.abs(y) + jnp.abs(value)
 
         return {
@@ -104,8 +109,9 @@ class Stages(eqx.Module):
         Returns the unknown values of all blocks, and whether all blocks are solved. A path
         that is not `pending` is left alone.
 
-        `solve(image, scale, guess, pending)` does the same for one block, of which `image`
-        is the function Phi, and `scale` is as the method `scale`."""
+        `solve(image, scale, guess, pending)` solves the equations `k = image(k)` of one
+        block. It returns `k`, and whether it is a solution. `scale(k)` are the sizes to
+        which its tolerance is relative, as in the method `scale`."""
         known: KnownValues = {}
         unknown: Unknown = {}
         all_solved = jnp.array(True)
@@ -128,18 +134,16 @@ class Stages(eqx.Module):
         guess: Unknown,
         pending: Bool[Array, ""],
     ) -> tuple[Unknown, Bool[Array, ""]]:
-        """The unknown values of one block, and whether they solve its equations."""
+        """The unknown values of one block, and whether they solve its equations, by `solve`
+        as for `solve_blocks`. `known` are the values of the stages of earlier blocks."""
         block_guess = {group: guess[group] for group in block.unknown}
 
         def block_image(unknown: Unknown) -> Unknown:
             known_with_block = self._with_block(block, known, unknown)
             return self._values(block.unknown, known_with_block)
 
-        are_pairs = all(map(_is_pair, block_guess.values()))
-        if self.in_halves and are_pairs:
-            return _solve_in_halves(
-                solve, block_image, self.scale, block_guess, pending
-            )
+        if self.in_halves and all(map(_is_pair, block_guess.values())):
+            solve = ft.partial(_solve_in_halves, solve)
         return solve(block_image, self.scale, block_guess, pending)
 
     def image(self, unknown: Unknown) -> Unknown:
@@ -172,16 +176,18 @@ class Stages(eqx.Module):
         stores_shared: bool = False,
     ) -> KnownValues:
         """`known` with the values of all stages of a block added. The values of its unknown
-        stages are those in `unknown`; its explicit stages are evaluated. With
-        `stores_shared`, an explicit value that is used several times is stored, so that XLA
-        does not compute it again for each use. (Within an iteration of the root finder,
-        storing a value costs as much as computing it again.)"""
+        stages are taken from `unknown`; its explicit stages are evaluated.
+
+        With `stores_shared`, an explicit value that is used several times is stored, so
+        that XLA does not compute it again for each use. (Within an iteration of the root
+        finder, storing a value costs as much as computing it again.)"""
         # Each `|` makes a new dictionary, and the caller's is not changed: the root finder
         # traces an iteration more than once, from the same known values.
         for group in block.unknown:
             known = known | _unstack(group, unknown[group])
-        # Row `i` has the coefficients of the state of stage `i`, and the last row those of
-        # the end of the step. So column `j` shows where the value of stage `j` is used.
+        # Row `i` has the coefficients of the state at which stage `i` is evaluated, and the
+        # last row the coefficients of the end of the step. So column `j` shows where the
+        # value of stage `j` is used.
         tableau = self.plan.tableau
         coefficients = np.vstack([tableau.matrix, tableau.weights])
         for group in block.explicit:
@@ -193,7 +199,8 @@ class Stages(eqx.Module):
         return known
 
     def _evaluate(self, group: Group, known: KnownValues) -> _Value:
-        """The values of the stages in a group, stacked unless there is only one."""
+        """The values of the stages in a group, stacked unless there is only one. The state
+        of each stage follows from its row of coefficients and the known values."""
         tableau = self.plan.tableau
         rows = tableau.matrix[list(group)]
         states = _states(self.y0, tableau.stages, rows, known)
@@ -201,6 +208,7 @@ class Stages(eqx.Module):
         # The stages of a group have the same channels and write the same part of the state.
         first = stages[0]
 
+        # `c` is the time of a stage as a fraction of the step.
         def value_at(c: RealScalarLike, y: Y) -> _Value:
             t = self.step.t0 + c * self.step.h
             changes = [self.step.changes[name](t, y) for name in first.channels]
@@ -224,8 +232,9 @@ def _solve_in_halves(
     guess: Unknown,
     pending: Bool[Array, ""],
 ) -> tuple[Unknown, Bool[Array, ""]]:
-    """`solve(image, scale, guess, pending)` for values that are pairs (p, q). `solve` gets
-    them as `Halves`, so that its sweeps update all momenta, then all positions."""
+    """`solve(image, scale, guess, pending)` for values that are pairs `(p, q)`, one for
+    each group. `solve` gets them as one pair, `Halves`, of the momenta and the positions of
+    all groups, so that its sweeps update all momenta, then all positions."""
 
     def halves_of(values: Unknown) -> Halves:
         momenta = {group: p for group, (p, _) in values.items()}
@@ -251,51 +260,6 @@ def _is_pair(y: Y) -> bool:
     return type(y) is tuple and len(y) == 2
 
 
-# The number of operations that compute the two halves of a change one by one, divided by
-# the number that compute both together: 1 if the halves share no operation, 2 if they share
-# all. Above this ratio they are computed together, and sweeps update two copies of all
-# unknowns in turn. Such sweeps cost about the same and are fewer:
-#
-# - For a qubit under measurement (ratio 1.76) a step takes 24 evaluations in place of 44
-#   for one path, and 65 in place of 106 for the slowest of 1,024 paths.
-# - For amplitudes on four sites (1.77) and two damped spins (1.58) a step takes 0.63 to
-#   0.74 times as many sweeps, for h = 0.1 to 0.6.
-_LEAST_RATIO_TOGETHER = 1.5
-
-
-def _computes_halves_together(step: Step, y0: Y) -> bool:
-    """Whether the changes of both halves of a pair share most of their operations, as for
-    an amplitude whose real and imaginary parts are the halves. A sweep that updates one
-    half after the other would compute the shared operations twice."""
-    if not _is_pair(y0):
-        return False
-
-    def whole_change(y: Y) -> Y:
-        return tree_sum([change(step.t0, y) for change in step.changes.values()])
-
-    program = jax.make_jaxpr(whole_change)(y0).jaxpr
-    # The results of the program are the leaves of the first half, then those of the second.
-    first, _ = y0
-    num_first = len(jtu.tree_leaves(first))
-    num_second = len(program.outvars) - num_first
-
-    def operations_for(is_needed: list[bool]) -> int:
-        """The number of operations for the results that are needed."""
-        remaining, _ = dce_jaxpr(program, is_needed)
-        return _num_operations(remaining)
-
-    for_first = operations_for([True] * num_first + [False] * num_second)
-    for_second = operations_for([False] * num_first + [True] * num_second)
-    together = operations_for([True] * len(program.outvars))
-    return for_first + for_second > _LEAST_RATIO_TOGETHER * together
-
-
-def _num_operations(program: Jaxpr) -> int:
-    """The number of operations in a program, with those of the programs that it calls."""
-    inner = [part for eqn in program.eqns for part in programs_in(eqn)]
-    return len(program.eqns) + sum(map(_num_operations, inner))
-
-
 def _unstack(group: Group, value: _Value) -> KnownValues:
     """The values of the stages in a group, by stage number, from its stacked `value`."""
     if len(group) == 1:
@@ -319,23 +283,24 @@ def _part(y: PyTree, name: str) -> PyTree:
 def _states(
     y0: Y, stages: tuple[Stage, ...], rows: np.ndarray, known: KnownValues
 ) -> PyTree[Array]:
-    """The states `y0 + sum_i rows[:, i] known[i]`, one for each row of coefficients,
-    stacked unless there is only one row. A stage whose value is not in `known` counts as
-    zero."""
+    """For each row `a` of coefficients the state `y0 + sum_i a[i] known[i]`, where `i` are
+    the numbers of the known stages. The states are stacked unless there is only one row.
+
+    If the stages write halves of states, each half is moved by the stages that write it."""
 
     def moved(part: str) -> PyTree[Array]:
-        """This part of the states: the part of `y0`, moved by the stages that write it."""
+        """The states, if `part` is `"y"`, or their half `"p"` or `"q"`."""
         start = _part(y0, part)
-        # Products with zero are left out here. XLA may not drop them: the product of zero
-        # and infinity is NaN.
-        products = [
-            _product(rows[:, i], value)
-            for i, value in known.items()
-            if rows[:, i].any() and stages[i].writes == part
-        ]
+        products = []
+        for i, value in known.items():
+            # Products with zero are left out here. XLA may not drop them: the product of
+            # zero and infinity is NaN.
+            if stages[i].writes == part and rows[:, i].any():
+                products.append(_products(rows[:, i], value))
         if products:
             # Add the small terms first, for fewer roundings at the size of the state.
             return (start**ω + tree_sum(products) ** ω).ω
+        # No stage moves this part, so all states have that of `y0`.
         return start if len(rows) == 1 else jtu.tree_map(for_each_row, start)
 
     def for_each_row(x: Array) -> Array:
@@ -347,19 +312,20 @@ def _states(
     return moved("p"), moved("q")
 
 
-def _product(weights: np.ndarray, value: _Value) -> PyTree[Array]:
-    """A value times each of these weights, stacked unless there is only one."""
+def _products(weights: np.ndarray, value: _Value) -> PyTree[Array]:
+    """The products of `value` with each of these weights, stacked unless there is only
+    one."""
     if len(weights) == 1:
         weight = float(weights[0])
         # A product with one would stay in the program.
         return value if weight == 1 else (weight * value**ω).ω
 
-    def products(x: Array) -> Any:
+    def stacked_products(x: Array) -> Any:
         # The weights along a new first axis, and an axis of length one for each of `x`.
         as_column = (-1, *[1] * x.ndim)
         return weights.astype(x.dtype).reshape(as_column) * x
 
-    return jtu.tree_map(products, value)
+    return jtu.tree_map(stacked_products, value)
 
 
 def take_step(
@@ -369,9 +335,9 @@ def take_step(
     solver: diffrax.AbstractSolver,
     last_outcome: Outcome = None,
 ) -> tuple[Y, Outcome]:
-    """The state at the end of the step, and the outcome. If there are stage equations, the
-    root finder of `solver` solves them; it skips paths whose `last_outcome` is a failure.
-    """
+    """The state at the end of the step from `y0`, and the outcome. If there are stage
+    equations, the root finder of `solver` solves them; it skips paths whose `last_outcome`
+    is a failure."""
     if not any(block.unknown for block in plan.blocks):
         return Stages(plan, step, y0).end({}), last_outcome
     if not isinstance(solver, diffrax.AbstractImplicitSolver):
@@ -414,7 +380,8 @@ def _jitted_implicit_step(
     finder: Any,
     max_steps: int,
 ) -> tuple[Y, optx.RESULTS]:
-    """The state at the end of the step, and the outcome."""
+    """`take_step` for a plan with unknown stages: makes the stages from functions that can
+    be differentiated, and chooses how sweeps update them."""
     # `filter_closure_convert` makes the arrays that a function captures leaves of a PyTree,
     # so that `_implicit_step` sees derivatives with respect to them. A converted function
     # accepts only the types that it was converted for, so `t0` and `h` get theirs first.
@@ -432,6 +399,56 @@ def _jitted_implicit_step(
         stages, last_outcome, finder=finder, max_steps=max_steps
     )
     return y1, outcome
+
+
+# The number of operations that compute the two halves of a change one by one, divided by
+# the number that compute both together: 1 if the halves share no operation, 2 if they share
+# all. Above this ratio they are computed together. Then sweeps keep two copies y and z of
+# all unknowns, both momenta and positions, and update them in turn: y = Phi(z), z = Phi(y).
+# Such sweeps cost about the same and are fewer:
+#
+# - For a qubit under measurement (ratio 1.76) a step takes 24 evaluations in place of 44
+#   for one path, and 65 in place of 106 for the slowest of 1,024 paths.
+# - For amplitudes on four sites (1.77) and two damped spins (1.58) a step takes 0.63 to
+#   0.74 times as many sweeps, for h = 0.1 to 0.6.
+_LEAST_RATIO_TOGETHER = 1.5
+
+
+def _computes_halves_together(step: Step, y0: Y) -> bool:
+    """Whether the changes of both halves of a pair share most of their operations, as for
+    an amplitude whose real and imaginary parts are the halves. A sweep that updates one
+    half after the other would compute the shared operations twice.
+
+    The operations are counted in the program of the whole change, and in what is left of it
+    if only the change of one half is needed."""
+    if not _is_pair(y0):
+        return False
+
+    def whole_change(y: Y) -> Y:
+        return tree_sum([change(step.t0, y) for change in step.changes.values()])
+
+    program = jax.make_jaxpr(whole_change)(y0).jaxpr
+    # The results of the program are the leaves of the first half, then those of the second.
+    first, _ = y0
+    num_first = len(jtu.tree_leaves(first))
+    num_second = len(program.outvars) - num_first
+
+    def operations_for(is_needed: list[bool]) -> int:
+        """The number of operations for the results that are needed."""
+        # Dead-code elimination drops each operation that no needed result depends on.
+        remaining, _ = dce_jaxpr(program, is_needed)
+        return _num_operations(remaining)
+
+    for_first = operations_for([True] * num_first + [False] * num_second)
+    for_second = operations_for([False] * num_first + [True] * num_second)
+    together = operations_for([True] * len(program.outvars))
+    return for_first + for_second > _LEAST_RATIO_TOGETHER * together
+
+
+def _num_operations(program: Jaxpr) -> int:
+    """The number of operations in a program, with those of the programs that it calls."""
+    inner = [part for eqn in program.eqns for part in programs_in(eqn)]
+    return len(program.eqns) + sum(map(_num_operations, inner))
 
 
 @eqx.filter_custom_jvp
@@ -471,6 +488,9 @@ def _implicit_step(
 
 @_implicit_step.def_jvp
 def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
+    """The tangents of the step by the implicit function theorem. The unknown values k
+    satisfy k = Phi(k, x), where x are the variables in `stages`. So the tangents satisfy
+    the linear equation dk = (dPhi / dk) dk + (dPhi / dx) dx."""
     stages, last_outcome = primals
     t_stages, _ = tangents
     y1, unknown, result = _implicit_step(
@@ -488,8 +508,7 @@ def _implicit_step_jvp(primals, tangents, *, finder, max_steps):
     def end_of_step(variables: Stages, unknown: Unknown) -> Y:
         return eqx.combine(variables, constants).end(unknown)
 
-    # The unknown values k satisfy k = Phi(k, x), where x are the variables. So the tangents
-    # satisfy dk = (dPhi / dk) dk + (dPhi / dx) dx.
+    # `rhs` is (dPhi / dx) dx, and `linear` the function that multiplies by dPhi / dk.
     _, rhs = jax.jvp(image_of_root, (variables,), (t_stages,))
     _, linear = jax.linearize(stages.image, root)
     # The linear solver of a root finder, as in `PicardNewton` and `optx.Newton`, serves for

@@ -47,7 +47,7 @@ def result_with_times_checked(
     t0 = jnp.asarray(t0)
     t1 = jnp.asarray(t1)
     h = t1 - t0
-    # The times of a single step may be integers.
+    # The times of a single step may be integers, which count as single precision here.
     eps = float(jnp.finfo(jnp.result_type(t0, jnp.float32)).eps)
     is_too_short = h < _LEAST_ULPS * eps * jnp.maximum(jnp.abs(t0), jnp.abs(t1))
     result = R.where(is_too_short, R.dt_min_reached, result)
