@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 
 from .._batch import where_pending
 from .linear import LinearSolver, MAX_WRITTEN_OUT, reduction_to_rounding, solve
-from .sweeps import solve_by_sweeps
+from .sweeps import solve_by_sweeps, unknowns_themselves
 from .tolerance import Tolerance
 
 
@@ -63,14 +63,11 @@ def _solve(
     def image(x: Float[Array, " n"]) -> Float[Array, " n"]:
         return x + (rhs - operator(x))
 
-    def scale(x: Float[Array, " n"]) -> Float[Array, " n"]:
-        return x
-
     by_sweeps, is_solved = solve_by_sweeps(
         _TOLERANCE,
         _MOST_SWEEPS,
         image,
-        scale,
+        unknowns_themselves,
         guess=jnp.zeros_like(rhs),
         pending=jnp.array(True),
     )

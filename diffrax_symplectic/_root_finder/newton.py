@@ -75,10 +75,13 @@ def solve_by_newton(
     linear_solver: lx.AbstractLinearSolver | None,
     max_iterations: int,
 ) -> tuple[_Vector, optx.RESULTS]:
-    """Newton's method with continuation, for `residual(k) = 0` with a vector `k`: first for
-    the full equations from a `guess`, and if that fails, part by part from `start`. Returns
-    the last iterate, after at most so many iterations, and whether it is a solution.
-    `restore` maps the vector to a PyTree, for which `scale` and `tolerance` are meant."""
+    """Solves `residual(k) = 0` for a vector `k` by Newton's method: first the full
+    equations from `guess`, and if that fails, part by part from `start` (see `Progress`).
+    Returns the last iterate, and success or the reason why it is no solution.
+
+    - `restore`: maps the vector to the PyTree that `scale` and `tolerance` take.
+    - `scale`: maps unknowns to the size of the state that they change.
+    """
 
     def is_going(carry: tuple) -> Bool[Array, ""]:
         count, _, progress = carry
@@ -86,8 +89,9 @@ def solve_by_newton(
         return in_time & ~progress.is_solved & ~progress.has_turned_back
 
     def iterate(carry: tuple) -> tuple:
-        """One iteration for the current target: the corrected iterate, or the guess for the
-        next target."""
+        """One iteration for the current target, and the choice of the next target. After
+        the iteration the whole step `is_solved`, or `part_is_solved`, or Newton's method
+        `has_failed`, or none of these and the target stays the same."""
         count, k, progress = carry
         s = progress.target
         is_whole_step = progress.target == 1
@@ -108,13 +112,10 @@ def solve_by_newton(
             correction_size.is_rounding,
             has_stalled=shrinkage >= _SHRINKAGE_AT_ROUNDING,
         )
-        # Far from any solution, rounding errors of a large Jacobian can hide the unknowns
-        # with small coefficients. Corrections are then small, but not the residual, which
-        # for a solution is no larger than the state.
         size_of_iterate = max_norm(k)
-        size_of_scale = largest([max_norm(x) for x in jtu.tree_leaves(scale_of_next)])
-        allowed_residual = jnp.maximum(size_of_scale, size_of_iterate)
-        residual_fits = max_norm(newton.residual) <= allowed_residual + tolerance.atol
+        residual_fits = _residual_fits(
+            newton.residual, size_of_iterate, scale_of_next, tolerance.atol
+        )
         is_correct = newton.found & residual_fits & all_finite(next_k)
         is_solved = has_converged & is_whole_step & is_correct
         is_near = max_norm(newton.change) < _TOLERANCE_OF_PART * size_of_iterate
@@ -122,8 +123,8 @@ def solve_by_newton(
         next_progress = progress._replace(
             tries=progress.tries + 1, size=size, is_solved=is_solved
         )
-        cannot_go_on = _cannot_go_on(next_progress, shrinkage, is_whole_step)
-        has_failed = cannot_go_on & ~part_is_solved & ~is_solved
+        is_stuck = _is_stuck(next_progress, shrinkage, is_whole_step)
+        has_failed = is_stuck & ~part_is_solved & ~is_solved
         return count + 1, *_next_target(
             next_progress, next_k, part_is_solved, has_failed
         )
@@ -153,12 +154,30 @@ def solve_by_newton(
     return k, R.where(progress.is_solved, R.successful, failure)
 
 
-def _cannot_go_on(
+def _residual_fits(
+    residual: _Vector, size_of_iterate: Scalar, scale: PyTree[Array], atol: float
+) -> Bool[Array, ""]:
+    """Whether the residual is no larger than the iterate or the state, whose size is
+    `scale`, as for any solution. Far from solutions, rounding errors of a large Jacobian
+    can hide the unknowns with small coefficients: corrections are then small, but not the
+    residual."""
+    size_of_state = largest([max_norm(x) for x in jtu.tree_leaves(scale)])
+    allowed_size = jnp.maximum(size_of_state, size_of_iterate)
+    return max_norm(residual) <= allowed_size + atol
+
+
+def _is_stuck(
     progress: Progress, shrinkage: Scalar, is_whole_step: Bool[Array, ""]
 ) -> Bool[Array, ""]:
-    """Whether further iterations would not reach the target: where the last correction is
-    not finite, is not smaller than the one before by enough, or is one of too many.
-    `is_whole_step` is whether the target is the end of the step."""
+    """Whether further iterations would not reach the target, since the last correction
+
+    - is not finite,
+    - is not smaller than the one before by enough, after `num_may_grow` iterations,
+    - or is one of too many for a part of the step.
+
+    `shrinkage` is the ratio of its size to that of the one before, and `is_whole_step` is
+    whether the target is the end of the step.
+    """
     # The whole step at once is tried first, from a guess that may be poor. The last part of
     # a continuation has the same target, but begins near a solution, or fails soon.
     is_first_try = is_whole_step & (progress.reached == 0)
@@ -176,10 +195,14 @@ def _next_target(
     part_is_solved: Bool[Array, ""],
     has_failed: Bool[Array, ""],
 ) -> tuple[_Vector, Progress]:
-    """The next iterate and target, from the iterate `k`: a target further ahead if this
-    one was reached by a part of the step, `part_is_solved`; a nearer one, from the anchor,
-    if Newton's method `has_failed`; and otherwise the same."""
+    """The next iterate and target, from the corrected iterate `k`:
+
+    - `part_is_solved`: continues from `k`, the new anchor, to a target further ahead.
+    - `has_failed`: goes back to the anchor, for a nearer target.
+    - otherwise: continues from `k` to the same target.
+    """
     target = progress.target
+    # How much of the step this part is.
     stride = progress.target - progress.reached
     further = jnp.minimum(target + _FACTOR_AFTER_SUCCESS * stride, 1)
     nearer = progress.reached + _FACTOR_AFTER_FAILURE * stride

@@ -1,3 +1,6 @@
+"""The root finder for stage equations: sweeps for all paths, then Newton's method for the
+paths that sweeps leave unsolved."""
+
 import functools as ft
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -14,7 +17,7 @@ from .._arguments import whole_number
 from .._batch import batched_like, where_pending
 from .._compat import ω
 from .newton import solve_by_newton
-from .sweeps import solve_by_sweeps
+from .sweeps import solve_by_sweeps, unknowns_themselves
 from .tolerance import all_finite, Tolerance
 
 
@@ -114,22 +117,26 @@ class PicardNewton(
 
     def step(self, fn, y, args, options, state, tags):
         del tags
-        scale = options.get("scale", _unknowns_themselves)
-        # A guess that is not finite stands for a path that failed before. It is left alone,
-        # so that the others of its batch need not wait for it, and counts as solved: the
-        # path stays not finite, which its caller sees.
+        scale = options.get("scale", unknowns_themselves)
+        # A guess that is not finite stands for a path that failed before. Such a path is
+        # left alone, so that the others of its batch need not wait for it, and counts as
+        # solved: its unknowns stay not finite, by which the caller sees the failure.
         can_solve = all_finite(y)
         tolerance = Tolerance(self.rtol, self.atol, self.norm)
         sweep = ft.partial(solve_by_sweeps, tolerance, self.picard_steps)
+
+        def equations(k: PyTree[Array]) -> PyTree[Array]:
+            """The value of `k - Phi(k)`."""
+            value, _ = fn(k, args)
+            return value
+
         if "solve_blocks" in options:
             solve_blocks = options["solve_blocks"]
             by_sweeps, solved_by_sweeps = solve_blocks(args, sweep, y, can_solve)
         else:
 
             def image(k: PyTree[Array]) -> PyTree[Array]:
-                # The equations are given as k - Phi(k) = 0.
-                residual, _ = fn(k, args)
-                return (k**ω - residual**ω).ω
+                return (k**ω - equations(k) ** ω).ω
 
             by_sweeps, solved_by_sweeps = sweep(image, scale, y, can_solve)
         # Newton's method is for the paths that sweeps did not solve.
@@ -139,33 +146,46 @@ class PicardNewton(
             y_new = by_sweeps
             result = optx.RESULTS.where(pending, _UNSOLVED, _SUCCESSFUL)
         else:
-            # The unknowns are one vector: a loop needs separate kernels to select, gather
-            # and scatter each array of its state.
-            k, restore = jfu.ravel_pytree(by_sweeps)
-            # Continuation starts from the guess of the step, not where the sweeps ended.
-            start, _ = jfu.ravel_pytree(y)
-
-            solver = self.linear_solver
-            max_steps = self.newton_steps
-
-            def residual(k: Array) -> Array:
-                value, _ = fn(restore(k), args)
-                return jfu.ravel_pytree(value)[0]
-
-            def solve(value: tuple[Array, optx.RESULTS]) -> tuple[Array, optx.RESULTS]:
-                k, _ = value
-                return solve_by_newton(
-                    residual, k, start, restore, scale, tolerance, solver, max_steps
-                )
-
-            k, result = where_pending(solve, pending, (k, _SUCCESSFUL))
-            y_new = restore(k)
+            y_new, result = self._solve_stragglers(
+                equations, scale, tolerance, pending, guess=y, by_sweeps=by_sweeps
+            )
         is_solved = result == _SUCCESSFUL
-        aux = state.aux
         # The equations are evaluated once more only if there is auxiliary output.
+        aux = state.aux
         if jtu.tree_leaves(state.aux):
             _, aux = fn(y_new, args)
         return y_new, _FinderState(is_solved, result, state.aux), aux
+
+    def _solve_stragglers(
+        self,
+        equations: Callable[[PyTree[Array]], PyTree[Array]],
+        scale: Callable[[PyTree[Array]], PyTree[Array]],
+        tolerance: Tolerance,
+        pending: Bool[Array, ""],
+        guess: PyTree[Array],
+        by_sweeps: PyTree[Array],
+    ) -> tuple[PyTree[Array], optx.RESULTS]:
+        """The unknowns and the result for all paths: by Newton's method, from where the
+        sweeps ended, for the paths that are `pending`, and `by_sweeps` for the others."""
+        # The unknowns are one vector: a loop needs separate kernels to select, gather and
+        # scatter each array of its state.
+        flat_by_sweeps, restore = jfu.ravel_pytree(by_sweeps)
+        # Continuation starts from the guess of the step, not where the sweeps ended.
+        start, _ = jfu.ravel_pytree(guess)
+        solver = self.linear_solver
+        max_iterations = self.newton_steps
+
+        def residual(k: Array) -> Array:
+            return jfu.ravel_pytree(equations(restore(k)))[0]
+
+        def solve(value: tuple[Array, optx.RESULTS]) -> tuple[Array, optx.RESULTS]:
+            k, _ = value
+            return solve_by_newton(
+                residual, k, start, restore, scale, tolerance, solver, max_iterations
+            )
+
+        k, result = where_pending(solve, pending, (flat_by_sweeps, _SUCCESSFUL))
+        return restore(k), result
 
     def terminate(self, fn, y, args, options, state, tags):
         del fn, y, args, options, tags
@@ -174,7 +194,3 @@ class PicardNewton(
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         del fn, args, options, state, tags, result
         return y, aux, {}
-
-
-def _unknowns_themselves(k: PyTree[Array]) -> PyTree[Array]:
-    return k

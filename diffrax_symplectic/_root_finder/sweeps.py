@@ -25,15 +25,13 @@ from .tolerance import converged, CorrectionSize, log2, LOG2_MARGIN, Tolerance
 
 Map: TypeAlias = Callable[[PyTree[Array]], PyTree[Array]]
 
-# Sweeps before the first convergence check, as needed for a short step, whose error shrinks
-# by a factor of about 60 in each: 60^9 is 1e16, for the digits of double precision, and
-# 60^6 is beyond the 1e8 of single precision.
-_FIRST_IN_DOUBLE = 9
-_FIRST_IN_SINGLE = 6
+# Sweeps before the first convergence check, in double and in single precision, as needed
+# for a short step, whose error shrinks by a factor of about 60 in each: 60^9 is 1e16, for
+# the digits of double precision, and 60^6 is beyond the 1e8 of single precision.
+_FIRST_SWEEPS = (9, 6)
 # The same for a doubled system. Fewer sweeps suffice, since each evaluates everything
 # twice.
-_FIRST_DOUBLED_IN_DOUBLE = 6
-_FIRST_DOUBLED_IN_SINGLE = 5
+_FIRST_SWEEPS_DOUBLED = (6, 5)
 # The most sweeps between two convergence checks: rates near one are not known accurately.
 _MOST_BETWEEN_CHECKS = 32
 # The most sweeps until the next check when corrections are as small as rounding errors.
@@ -111,15 +109,10 @@ def solve_by_sweeps(
     in_halves = isinstance(guess, Halves)
     start = guess if in_halves else Halves(guess, guess)
     dtype = jnp.result_type(*jtu.tree_leaves(guess))
-    in_single = jnp.finfo(dtype).bits < 64
-    if in_halves:
-        first_sweeps = _FIRST_IN_SINGLE if in_single else _FIRST_IN_DOUBLE
-    else:
-        first_sweeps = (
-            _FIRST_DOUBLED_IN_SINGLE if in_single else _FIRST_DOUBLED_IN_DOUBLE
-        )
+    in_double, in_single = _FIRST_SWEEPS if in_halves else _FIRST_SWEEPS_DOUBLED
+    first_sweeps = in_single if jnp.finfo(dtype).bits < 64 else in_double
 
-    def value_of(y: Halves) -> PyTree[Array]:
+    def value_of(y: PyTree[Array]) -> PyTree[Array]:
         """The unknowns. For a doubled system either half would do."""
         return y if in_halves else y.q
 
@@ -179,16 +172,14 @@ def _sweep_until_check(
     def new_q(y: Halves) -> PyTree[Array]:
         return image(y).q if in_halves else image(y.p)
 
-    def relaxed(new: PyTree[Array], old: PyTree[Array]) -> PyTree[Array]:
-        def relaxed_leaf(new: Array, old: Array) -> Array:
-            return old + state.relaxation.astype(new.dtype) * (new - old)
-
-        return jtu.tree_map(relaxed_leaf, new, old)
+    def relaxed(new: Array, old: Array) -> Array:
+        return old + state.relaxation.astype(new.dtype) * (new - old)
 
     def sweep(_, y: Halves) -> Halves:
+        p = jtu.tree_map(relaxed, new_p(y), y.p)
         # The positions are updated with the new momenta.
-        y = Halves(relaxed(new_p(y), y.p), y.q)
-        return Halves(y.p, relaxed(new_q(y), y.q))
+        q = jtu.tree_map(relaxed, new_q(Halves(p, y.q)), y.q)
+        return Halves(p, q)
 
     if not in_halves:
         y = lax.fori_loop(0, state.num_ahead, sweep, state.y)
@@ -212,6 +203,13 @@ def _decide(
     max_sweeps: int,
 ) -> tuple[_SweepState, Bool[Array, ""]]:
     """A convergence check: decides from the size of the last correction how a path goes on.
+
+    - If it has converged, it ends as solved.
+    - If it converges too slowly to be solved in time, it ends, for Newton's method.
+    - If it does not converge, it starts again from its guess with strong under-relaxation,
+        or if it did so before, ends, for Newton's method.
+    - Otherwise it makes as many sweeps as its rate of convergence asks for.
+
     Returns the next state, with `None` for the iterate, and whether the path goes back to
     its guess.
 
@@ -262,6 +260,11 @@ def _decide(
         num_ahead=jnp.minimum(largest_in_batch(num_ahead), _MOST_BETWEEN_CHECKS),
     )
     return next_state, ~(keeps_iterate | has_converged)
+
+
+def unknowns_themselves(k: PyTree[Array]) -> PyTree[Array]:
+    """The `scale` of corrections if there is no other: the unknowns."""
+    return k
 
 
 def best_relaxation(rate: Scalar) -> Scalar:

@@ -150,10 +150,15 @@ def log2(x: Scalar) -> Scalar:
 def converged(
     log2_size: Scalar, log2_rate: Scalar, is_rounding: _Flag, has_stalled: _Flag
 ) -> _Flag:
-    """Whether the next correction will be below the tolerance by `LOG2_MARGIN`; or
-    corrections no longer shrink (`has_stalled`) and are as small as rounding errors
-    (`is_rounding`). `log2_size` and `log2_rate` are the base-2 logarithms of the last
-    correction, in units of the tolerance, and of its ratio to the previous one."""
+    """Whether the iteration can end, since
+
+    - the next correction will be below the tolerance by `LOG2_MARGIN`;
+    - or corrections no longer shrink (`has_stalled`) and are as small as rounding errors
+        (`is_rounding`).
+
+    `log2_size` is the base-2 logarithm of the last correction, in units of the tolerance.
+    `log2_rate` is that of its ratio to the previous correction.
+    """
     # With linear convergence the next correction is smaller by the same ratio. A correction
     # that grew says nothing about the next one, so that it must be small itself.
     next_log2_size = log2_size + jnp.minimum(log2_rate, 0)

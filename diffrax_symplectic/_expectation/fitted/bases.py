@@ -64,9 +64,9 @@ class CovarianceFrame(eqx.Module):
     def of(
         points: Float[Array, "n d"], good: Bool[Array, " n"], scales: Float[Array, " d"]
     ) -> "CovarianceFrame":
-        """The frame along the axes of the covariance of the good points. Components of the
-        state are made comparable by division by their `scales`, which are zero for
-        components that do not move."""
+        """The frame along the axes of the covariance of the good points. First each
+        component of the state is divided by its scale, so that components are comparable.
+        `scales` are zero for components that do not move."""
         weights = equal_weights(good, points.dtype)
         mean = weights @ points
         inverse_scales = inverse_or_zero(scales)

@@ -60,16 +60,21 @@ class ChosenBasis(NamedTuple):
 
 
 def chosen_basis(problem: Problem, degree: int | None) -> ChosenBasis:
-    """The basis of the polynomials of this degree. For `None` it is a grid, if a grid fits
-    into memory and time, and otherwise the polynomials of the highest degree that fit.
+    """Chooses the basis of a fit:
+
+    - with a `degree`, the polynomials of this degree;
+    - otherwise the finest grid that fits into memory and time;
+    - otherwise the polynomials of the highest degree that fit into time.
+
     Raises a `ValueError` if the fit needs too much memory, or for random variables without
-    finitely many outcomes."""
+    finitely many outcomes.
+    """
     nodes, _ = Noise.of(problem, problem.level(0)).weighted_nodes()
     num_nodes = len(nodes)
     total_steps = int(np.sum(problem.levels.num_steps))
     d = problem.num_components
     num_outputs = math.prod(problem.output_shape)
-    # The functions of a fit, for all levels, steps, times and components.
+    # A fit has a function for each level, step, time at which to average, and component.
     num_functions = len(problem.levels.h) * room_for_steps(problem) * num_outputs
 
     def with_cost(basis: AbstractBasis) -> ChosenBasis:
@@ -79,17 +84,18 @@ def chosen_basis(problem: Problem, degree: int | None) -> ChosenBasis:
         )
 
     def fits_into_time(num_points: int) -> bool:
+        """Whether a fit at so many points takes few enough steps."""
         return num_points * num_nodes * total_steps <= _MOST_ENDS
 
+    # The finest grid that fits.
     if degree is None and d <= _MOST_DIMENSIONS_OF_GRID:
         for size in _SIZES_OF_GRID:
             grid = Grid(d, size)
             num_points = size**d
-            fits_into_step = num_points * num_nodes <= _MOST_ENDS_OF_STEP
+            has_few_ends = num_points * num_nodes <= _MOST_ENDS_OF_STEP
             # The loop over steps backward holds the coefficients twice.
             memory = 2 * problem.dtype.itemsize * grid.size * num_functions
-            fits_into_memory = fits_into_step and memory <= _MOST_MEMORY
-            if fits_into_memory and fits_into_time(num_points):
+            if has_few_ends and memory <= _MOST_MEMORY and fits_into_time(num_points):
                 return with_cost(grid)
 
     if degree is not None:

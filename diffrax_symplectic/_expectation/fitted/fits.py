@@ -3,7 +3,7 @@ some paths, whose states show where the functions are needed."""
 
 import dataclasses
 import functools as ft
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -52,6 +52,19 @@ class FittedFunctions(eqx.Module):
         return self.basis.value_at(frame, ravel(y), self.coefficients[i])
 
 
+class _Pilot(NamedTuple):
+    """The paths of a pilot run.
+
+    - `starts`: the states at the start.
+    - `states_after`: the states after each step.
+    - `good`: which paths did not fail.
+    """
+
+    starts: Float[Array, "paths d"]
+    states_after: Float[Array, "steps paths d"]
+    good: Bool[Array, " paths"]
+
+
 def room_for_steps(problem: Problem) -> int:
     """The number of steps for which the arrays of a fit have room on each level. (The
     number of steps itself is traced, but shapes must be known when compiling.)"""
@@ -76,11 +89,12 @@ def fit(
     noise = Noise.of(problem, problem.level(index))
     num_steps = noise.level.num_steps
     keys = jr.split(jr.fold_in(key, index), basis.num_pilots)
-    starts, states_after, good = _run_pilot(noise, keys, most_steps)
-    scales = _length_scales(noise, starts, states_after, good)
+    # 1. A simulation of some paths, the pilot, gives states at which to fit.
+    pilot = _run_pilot(noise, keys, most_steps)
+    scales = _length_scales(noise, pilot)
 
     def frame_after(i: Any) -> PyTree[Array]:
-        return basis.frame(states_after[i], good, scales)
+        return basis.frame(pilot.states_after[i], pilot.good, scales)
 
     def fit_step(num_fitted: Any, fitted: FittedFunctions) -> FittedFunctions:
         """Fits the functions after step `i`, counted from the last step backward."""
@@ -89,12 +103,16 @@ def fit(
         target = _target(noise, fitted, i)
         # All steps share the keys of the pilot's paths. Their draws are independent, since
         # the target also takes the number of the step to draw.
-        coefficients = basis.coefficients(target, frame, states_after[i], good, keys)
+        coefficients = basis.coefficients(
+            target, frame, pilot.states_after[i], pilot.good, keys
+        )
         fitted_after_i = FittedFunctions(frame, coefficients, None, basis)
         return jtu.tree_map(
             lambda all_steps, this: all_steps.at[i].set(this), fitted, fitted_after_i
         )
 
+    # 2. A loop backward in time fits the functions after each step to the mean of those
+    # after the next one.
     no_frames = jtu.tree_map(
         lambda x: jnp.zeros((most_steps, *x.shape), x.dtype),
         jax.eval_shape(frame_after, 0),
@@ -105,8 +123,9 @@ def fit(
     unfitted = FittedFunctions(no_frames, no_coefficients, None, basis)
     fitted = lax.fori_loop(0, num_steps, fit_step, unfitted)
 
-    # The states before a step are those after the step before: (steps, paths, d).
-    states_before = jnp.concatenate([starts[None], states_after[:-1]])
+    # 3. No fit reads second derivatives, so they are computed once, at the end. The states
+    # before a step are those after the previous step: (steps, paths, d).
+    states_before = jnp.concatenate([pilot.starts[None], pilot.states_after[:-1]])
     _, unravel = jfu.ravel_pytree(problem.y0)
 
     def second_derivatives_of_step(step_and_states):
@@ -114,33 +133,59 @@ def fit(
         ys = jax.vmap(unravel)(states)
         return noise.mean_second_derivatives(i, ys, ft.partial(fitted, i))
 
-    # No fit reads second derivatives, so they are computed once, at the end.
     second_derivatives = lax.map(
         second_derivatives_of_step,
         (jnp.arange(most_steps), states_before[:, :_STATES_FOR_SECOND]),
     )
     functions = dataclasses.replace(fitted, second_derivatives=second_derivatives)
-    return jtu.tree_map(lambda x: x[None], functions), jnp.sum(~good)
+    return jtu.tree_map(lambda x: x[None], functions), jnp.sum(~pilot.good)
 
 
-def _length_scales(
-    noise: Noise,
-    starts: Float[Array, "paths d"],
-    states_after: Float[Array, "steps paths d"],
-    good: Bool[Array, " paths"],
-) -> Float[Array, " d"]:
+def _run_pilot(noise: Noise, keys: Key[Array, " paths"], most_steps: int) -> _Pilot:
+    """Simulates a path for each key."""
+    problem = noise.problem
+    # With equal probabilities of all outcomes the pilot's paths spread further than others,
+    # so that the fit also holds for outliers.
+    num_values = [len(law.values) for law in noise.laws]
+    equal_cuts = cuts_of([np.full(count, 1 / count) for count in num_values])
+
+    def step_of_path(i, y, args, key):
+        x, _ = noise.draw(key, i, equal_cuts)
+        noise_of_path = noise.with_args(args)
+        # Solvers start anew in each step, which is good enough for a fit.
+        solver_state = noise_of_path.new_solver_state(i, y)
+        y, _, success = noise_of_path.step(i, y, solver_state, x)
+        return y, success
+
+    def step(i: Any, carry: tuple[PathStates, Array]) -> tuple[PathStates, Array]:
+        paths, states = carry
+        y, success = jax.vmap(ft.partial(step_of_path, i))(paths.y, paths.args, keys)
+        paths = paths.after_step(problem, y, None, success)
+        return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
+
+    paths = PathStates.start(
+        problem, jax.vmap(problem.draw_start)(keys), solver_state=None
+    )
+    starts = jax.vmap(ravel)(paths.y)
+    states = jnp.broadcast_to(starts, (most_steps, *starts.shape))
+    paths, states = lax.fori_loop(0, noise.level.num_steps, step, (paths, states))
+    return _Pilot(starts, states, ~paths.failed)
+
+
+def _length_scales(noise: Noise, pilot: _Pilot) -> Float[Array, " d"]:
     """How far each component of the state moves: the root of the mean squared distance from
     the start, over all steps of the good paths of the pilot run. It is zero for components
     that do not move."""
     start = ravel(noise.problem.y0)
     if noise.problem.y0_of is not None:
-        start = jnp.mean(starts, axis=0)
+        start = jnp.mean(pilot.starts, axis=0)
     # (steps, paths, d)
-    distances = jnp.where(good[:, None], jnp.abs(states_after - start), 0)
+    distances = jnp.where(pilot.good[:, None], jnp.abs(pilot.states_after - start), 0)
     # Dividing by the largest value first avoids underflow of squares in single precision.
     largest = jnp.max(distances, axis=(0, 1))
     scaled = distances / jnp.where(largest > 0, largest, 1)
-    weights = equal_weights(good, start.dtype)
+    weights = equal_weights(pilot.good, start.dtype)
+    # Means over the paths `n` of the squares, summed over the steps `i`.
     sum_over_steps = jnp.einsum("n,ind->d", weights, scaled**2)
     return largest * jnp.sqrt(sum_over_steps / noise.level.num_steps)
 
@@ -183,40 +228,3 @@ def _target(noise: Noise, fitted: FittedFunctions, i: Any) -> Target:
         return jnp.where(is_end_of_step[:, None], phi, mean_or_zero)
 
     return value
-
-
-def _run_pilot(
-    noise: Noise, keys: Key[Array, " paths"], most_steps: int
-) -> tuple[
-    Float[Array, "paths d"], Float[Array, "steps paths d"], Bool[Array, " paths"]
-]:
-    """Simulates a path for each key. Returns the states at the start, the states after each
-    step, and which paths did not fail."""
-    problem = noise.problem
-    # With equal probabilities of all outcomes the pilot's paths spread further than others,
-    # so that the fit also holds for outliers.
-    num_values = [len(law.values) for law in noise.laws]
-    equal_cuts = cuts_of([np.full(count, 1 / count) for count in num_values])
-
-    def step_of_path(i, y, args, key):
-        x, _ = noise.draw(key, i, equal_cuts)
-        noise_of_path = noise.with_args(args)
-        # Solvers start anew in each step, which is good enough for a fit.
-        solver_state = noise_of_path.new_solver_state(i, y)
-        y, _, success = noise_of_path.step(i, y, solver_state, x)
-        return y, success
-
-    def step(i: Any, carry: tuple[PathStates, Array]) -> tuple[PathStates, Array]:
-        paths, states = carry
-        y, success = jax.vmap(ft.partial(step_of_path, i))(paths.y, paths.args, keys)
-        paths = paths.after_step(problem, y, None, success)
-        return paths, states.at[i].set(jax.vmap(ravel)(paths.y))
-
-    paths = PathStates.start(
-        problem, jax.vmap(problem.draw_start)(keys), solver_state=None
-    )
-    starts = jax.vmap(ravel)(paths.y)
-    states = jnp.broadcast_to(starts, (most_steps, *starts.shape))
-    num_steps = noise.level.num_steps
-    paths, states = lax.fori_loop(0, num_steps, step, (paths, states))
-    return starts, states, ~paths.failed

@@ -127,7 +127,7 @@ class Grid(AbstractBasis):
         z = inner.coordinates(states)
         least = jnp.min(jnp.where(good[:, None], z, jnp.inf), axis=0)
         most = jnp.max(jnp.where(good[:, None], z, -jnp.inf), axis=0)
-        # A few paths suffice for the quartiles, which leave out NaNs.
+        # A few paths suffice for the quartiles, which leave out the NaNs of failed paths.
         few_paths = jnp.where(good[:, None], z, jnp.nan)[: self._base.num_pilots]
         probabilities = jnp.array([0.25, 0.5, 0.75])
         quartiles = jnp.nanquantile(few_paths, probabilities, axis=0)
@@ -140,10 +140,14 @@ class Grid(AbstractBasis):
             half_width / _MOST_STRETCH,
             half_width,
         )
-        # The coordinate is `c(factor * (z - median)) / edge`, with the function `c` that
-        # applies `_compressed` twice. At the edge its argument is `bend = factor *
-        # half_width`, so that `edge = c(bend)`. In the middle, where `c` has slope 1, the
-        # coordinate has the slope `factor / edge`, which must be `1 / uniform_half_width`.
+        # Two conditions give `factor` and `edge` of the coordinate
+        # `c(factor * (z - median)) / edge`, where `c` applies `_compressed` twice:
+        #
+        # 1. At the edge the coordinate is 1: `edge = c(bend)` for `bend = factor *
+        #    half_width`.
+        # 2. In the middle, where `c` has slope 1, the coordinate has the slope `factor /
+        #    edge`, which must be `1 / uniform_half_width`.
+        #
         # Together this is `bend / c(bend) = stretch`. The left side is one for `bend = 0`,
         # and about `bend ** (3 / 4)` for large `bend`. For a closed solution it is replaced
         # by `(1 + bend**2) ** (3 / 8)`, which has both properties.
@@ -160,7 +164,9 @@ class Grid(AbstractBasis):
         base = self._base
         num_pilots = base.num_pilots
         axes = [np.linspace(-1, 1, self.resolution)] * self.d
-        # The coordinates of the nodes, which are the grid points: (nodes, d).
+        # First, polynomials are fitted to the target near the pilot's states. What the best
+        # of them leaves of the target at the nodes, the grid points, is the correction.
+        # The coordinates of the nodes: (nodes, d).
         x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, self.d)
         nodes = frame.states(jnp.asarray(x, states.dtype))
         pilots = frame.inner.perturbed(states[:num_pilots])
@@ -195,7 +201,8 @@ class Grid(AbstractBasis):
     def interpolate(
         self, x: Float[Array, " d"], c: Float[Array, "nodes ..."]
     ) -> Float[Array, "..."]:
-        """Interpolates the values `c` on the grid at the point `x`. Beyond the grid the
+        """Interpolates the values `c` on the grid at the point `x`: a sum over a block of
+        the nearest grid points, weighted by Lagrange polynomials. Beyond the grid the
         result is zero."""
         # The number of grid points along each axis.
         n = self.resolution

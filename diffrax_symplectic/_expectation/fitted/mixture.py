@@ -76,11 +76,14 @@ class Mixture(eqx.Module):
         cuts = []
         log_ratios = []
         num_steps = problem.levels.num_steps
-        # All levels have equal parts of the entropy, and so have the steps of a level.
+        # The strength of a change of laws on a level follows from the relative entropy that
+        # one of its steps may have. All levels have equal parts of the whole entropy, and
+        # so have the steps of a level.
         for nats_of_step in _NATS / len(num_steps) / num_steps:
             width = _strongest_change(laws, _widened, 1.0, nats_of_step)
             largest_tilt = _strongest_change(laws, _tilted, _MOST_TILT, nats_of_step)
-            # For each law of the mixture and each variable, the probabilities of outcomes.
+            # For each law of the mixture, a list with the probabilities of the outcomes of
+            # each variable: the own law, the wider one, and those that push to a side.
             probabilities = [own, [_widened(law, width) for law in laws]]
             for signs in all_signs:
                 tilts = [largest_tilt * sign for sign in (*signs, *not_tilted)]
@@ -156,8 +159,9 @@ def _strongest_change(
     """The largest strength of a change of laws, up to `most`, for which the variables of a
     step together have a relative entropy of at most `most_nats` with respect to their own
     laws. A changed law has the probabilities `changed_probabilities(law, strength)`. The
-    relative entropy is the sum of `changed * log(changed / own)` over all outcomes, which
-    grows with the strength."""
+    relative entropy is the sum of `changed * log(changed / own)` over all outcomes. It
+    grows with the strength, so the strength is found by bisection."""
+    # Equal laws have equal entropies, which are computed once.
     law_counts = collections.Counter(laws)
     lower = 0.0
     upper = most

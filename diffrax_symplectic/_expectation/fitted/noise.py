@@ -37,15 +37,8 @@ WeightedNodes: TypeAlias = tuple[
 
 
 class Noise(eqx.Module):
-    r"""The random variables $x$ of the steps of a level. If a step has few outcomes, a step
-    is taken for each of them, and expectations are finite sums.
-
-    Otherwise the control variate $u(y_1) - \mathbb E[u(y_1)]$ is replaced by $a \cdot x +
-    \frac12 (x^\top C x - \mathrm{tr}\, C \Sigma)$, with the first and second derivatives
-    $a$ and $C$ of $u(y_1(x))$ at $x = 0$, and the variances $\Sigma$ of $x$. The
-    replacement is exact for a quadratic $u$ and noise that enters the step linearly. Its
-    mean is zero for any $a$ and $C$, so one $C$ serves all paths.
-    """
+    """The random variables `x` of the steps of a level. If a step has few outcomes, a step
+    is taken for each of them, and expectations are finite sums."""
 
     problem: Problem
     level: Level
@@ -86,7 +79,8 @@ class Noise(eqx.Module):
         Returns the values of the variables, and for each variable which of its outcomes it
         has. By `cuts`, as from `cuts_of`, a random word that is at or above `k` of the cuts
         of its variable gives outcome `k`."""
-        # These two numbers stand for the position of a step.
+        # The index and the level stand for the time and the length of a step, which a
+        # Brownian path would take.
         place = draw_index, jnp.asarray(self.level.index)
         # One set of words, with one word for each variable.
         words = random_words(key, place, 1, len(self.laws))[0]
@@ -114,7 +108,7 @@ class Noise(eqx.Module):
         # standard deviations with weight 1/6. The node at zero has the rest of the total
         # weight of one. The sum is exact for polynomials of degree 3, or 5 in one variable.
         n = len(self.laws)
-        nodes_on_axes = np.diag(np.sqrt(3 * self._variances()))
+        nodes_on_axes = np.diag(np.sqrt(3 * self.variances()))
         nodes = np.concatenate([nodes_on_axes, -nodes_on_axes, np.zeros((1, n))])
         weights = np.append(np.full(2 * n, 1 / 6), 1 - n / 3)
         return nodes.astype(self.problem.dtype), weights
@@ -132,46 +126,6 @@ class Noise(eqx.Module):
         values = jax.vmap(value)(nodes)
         return tensordot(weights.astype(values.dtype), values, 1)
 
-    def advance(
-        self,
-        i: Any,
-        y: Y,
-        solver_state: PyTree[Array],
-        u: Function,
-        second_derivatives: Array | None,
-        x: Array,
-    ) -> tuple[Y, PyTree[Array], Bool[Array, ""], Array]:
-        """Takes step `i` of a path with variables `x`. Returns the states of the path and
-        of the solver after the step, whether the step succeeded, and the control variate of
-        `u`, whose mean over `x` is zero. `second_derivatives` comes from
-        `mean_second_derivatives`."""
-        if self.few_outcomes is not None:
-            all_outcomes, probabilities = self.few_outcomes
-            step_by_outcome = jax.vmap(ft.partial(self.step, i, y, solver_state))
-            ends, solver_states, success = step_by_outcome(all_outcomes)
-            values = jax.vmap(u)(ends)
-            mean = tensordot(probabilities.astype(values.dtype), values, 1)
-            # The path itself takes the step whose outcome is equal to `x`.
-            index_of_x = jnp.argmax(jnp.all(all_outcomes == x, axis=1))
-            y1, next_solver_state, value = jtu.tree_map(
-                lambda of_outcomes: of_outcomes[index_of_x],
-                (ends, solver_states, values),
-            )
-            # If one of these steps fails, the mean is wrong, and so is the control variate.
-            return y1, next_solver_state, jnp.all(success), value - mean
-
-        # There are many outcomes: by the formula in the docstring of this class.
-        assert second_derivatives is not None
-        y1, next_solver_state, success = self.step(i, y, solver_state, x)
-        value_after = ft.partial(self._value_after, i, y, solver_state, u)
-        first_derivatives = jax.jacrev(value_after)(jnp.zeros_like(x))
-        # Multiplied by the second derivatives `C` entry by entry, and summed over all
-        # entries, this is `x^T C x - tr(C Sigma)`.
-        centred_square = jnp.outer(x, x) - np.diag(self._variances()).astype(x.dtype)
-        linear = tensordot(first_derivatives, x, 1)
-        quadratic = tensordot(centred_square, second_derivatives, 2) / 2
-        return y1, next_solver_state, success, linear + quadratic
-
     def mean_second_derivatives(self, i: Any, ys: Y, u: Function) -> Array | None:
         """The second derivatives of `u` after step `i` along the variables, averaged over
         the states `ys` before the step; `None` if there are few outcomes."""
@@ -181,7 +135,7 @@ class Noise(eqx.Module):
 
         def hessian(y: Y) -> Array:
             solver_state = self.new_solver_state(i, y)
-            value_after = ft.partial(self._value_after, i, y, solver_state, u)
+            value_after = ft.partial(self.value_after, i, y, solver_state, u)
             return jax.hessian(value_after)(zero)
 
         # One state after another, since a Hessian of many variables takes much memory.
@@ -190,7 +144,7 @@ class Noise(eqx.Module):
         # (n, n, S, m)
         return jnp.moveaxis(mean, (-2, -1), (0, 1))
 
-    def _value_after(
+    def value_after(
         self, i: Any, y: Y, solver_state: PyTree[Array], u: Function, x: Array
     ) -> Array:
         """The value of `u` after step `i` with variables `x`."""
@@ -212,7 +166,7 @@ class Noise(eqx.Module):
         solver_state = self.problem.init(terms, i, self.level.h, y)
         return jtu.tree_map(_hidden_if_result, solver_state)
 
-    def _variances(self) -> np.ndarray:
+    def variances(self) -> np.ndarray:
         """The variance of each variable. (All have mean zero.)"""
         return np.array(
             [np.dot(law.probabilities, np.square(law.values)) for law in self.laws]
@@ -220,10 +174,11 @@ class Noise(eqx.Module):
 
 
 def _hidden_if_result(x: Array) -> Array:
-    """Hides an array of a solver's state from XLA behind a barrier if the array is an
-    integer. An integer is the result of a solve, and in a new state it is a constant. While
-    compiling, XLA would evaluate for all states and outcomes what follows from this
-    constant: for 6,300 states and 27 outcomes it took more than a second, with an alarm."""
+    """Hides an integer of a solver's state from XLA behind a barrier, and returns other
+    arrays as they are. The integers are the results of solves, which in a new state are
+    constants. While compiling, XLA would evaluate for all states and outcomes what follows
+    from these constants: for 6,300 states and 27 outcomes it took more than a second, with
+    an alarm."""
     is_result = jnp.issubdtype(x.dtype, jnp.integer)
     return jax.lax.optimization_barrier(x) if is_result else x
 
@@ -250,10 +205,8 @@ def padded(rows: Sequence[np.ndarray]) -> np.ndarray:
 def count_outcomes(problem: Problem) -> int | None:
     """The number of outcomes of a step, or `None` if there are many or infinitely many."""
     try:
-        noise = Noise.of(problem, problem.level(0))
+        few_outcomes = Noise.of(problem, problem.level(0)).few_outcomes
     except ValueError:
+        # There are infinitely many.
         return None
-    if noise.few_outcomes is None:
-        return None
-    values, _ = noise.few_outcomes
-    return len(values)
+    return None if few_outcomes is None else len(few_outcomes[0])

@@ -40,6 +40,7 @@ from ..._simulation import (
     Problem,
     real_vector,
     simulate,
+    Simulated,
 )
 from ..._terms import brownian_paths, motion_numbers, replace_paths
 from ..estimate import heaviness
@@ -143,8 +144,8 @@ class ArrayRQMC(AbstractSampling):
 
 
 def _warn_if_far_apart(num_paths: int, num_coordinates: int) -> None:
-    """Warns if neighbours among so many paths, sorted by so many coordinates, are far
-    apart."""
+    """Warns if neighbours in the order of the paths are far apart, since there are too few
+    paths for the number of coordinates by which they are sorted."""
     # The number of paths along each edge of a cube that all paths fill evenly.
     num_along_coordinate = num_paths ** (1 / num_coordinates)
     if num_along_coordinate < _FEWEST_ALONG_COORDINATE:
@@ -169,16 +170,19 @@ def _samples_of_replicate(
     """Takes one sample: the mean over all paths of a replicate, by algorithm 1 of
     [L'Ecuyer, Lécot and Tuffin (2008)](https://doi.org/10.1287/opre.1080.0556).
 
-    `points` come from `sobol_points`, one for each path, with a coordinate for each random
-    word of a step.
+    - `sort_by`: maps the state to the numbers by which paths are sorted.
+    - `points`: from `sobol_points`, one for each path, with a coordinate for each random
+        word of a step.
+    - `layout`: which of these words each Brownian path of `terms` takes.
+    - `keys`: the random key of the replicate.
     """
     n, d = points.shape
     (replicate_key,) = keys
-    # The outer values of a three-point variable have probability 1/6 each, and a sixth of
-    # the points, whose number is a power of two, is not a whole number. So a single such
+    # Each outer value of a three-point variable has probability 1/6, but a sixth of the
+    # points, whose number is a power of two, is not a whole number. So a single three-point
     # variable is balanced in blocks of six points instead.
-    is_one_three_point = layout.is_one_three_point_variable
-    randomized = balanced_in_sixths if is_one_three_point else scrambled
+    is_in_sixths = layout.is_one_three_point_variable
+    randomized = balanced_in_sixths if is_in_sixths else scrambled
     # Starts are independent, rather than from Sobol' points, since a function of a key may
     # draw any number of random variables.
     start_keys = jr.split(jr.fold_in(replicate_key, _KEY_OF_STARTS), n)
@@ -212,25 +216,30 @@ def _samples_of_replicate(
 
         return Motion(sort_and_step, unsorted_motion.start)
 
-    simulated = simulate(problem, motion_on, measure=_statistics)
+    return _sample_of(problem, simulate(problem, motion_on, measure=_statistics))
+
+
+def _sample_of(problem: Problem, simulated: Simulated) -> Samples:
+    """The sample of a replicate, from the `_statistics` of its simulated paths."""
     # The saved array has the shape (levels, S, 3, m), with the three rows of `_statistics`.
-    # They become the first axis, and the only sample of this call gets an axis of its own:
+    # They become the first axis, and the only sample gets an axis of its own:
     # (3, levels, S, 1, m).
     statistics = jnp.moveaxis(simulated.saved[:, :, :, None], 2, 0)
     # (levels, 1, numbers) each.
-    mean_on_levels, r, largest = map(as_vectors, statistics)
+    mean_on_levels, heaviness_on_levels, largest_on_levels = map(as_vectors, statistics)
     mean = combinations(problem.weights, mean_on_levels)
     averaged = Averaged(
         mean,
-        # All combinations of levels get the largest `r` on any level.
-        heaviness=jnp.broadcast_to(jnp.max(r, axis=0), mean.shape),
+        # All combinations of levels get the greatest heaviness on any level.
+        heaviness=jnp.broadcast_to(jnp.max(heaviness_on_levels, axis=0), mean.shape),
         # An upper bound of the deviation of a path in a combination of levels. It is
         # reached if one path has the largest deviation on all levels.
-        largest=combinations(abs(problem.weights), largest),
+        largest=combinations(abs(problem.weights), largest_on_levels),
     )
+    _, num_paths = simulated.failed.shape
     num_failed = jnp.sum(simulated.failed, axis=1, keepdims=True)
     # A level on which all paths fail has no mean.
-    has_mean = jnp.all(num_failed < n, axis=0)
+    has_mean = jnp.all(num_failed < num_paths, axis=0)
     return Samples(averaged, good=has_mean, num_failed=num_failed)
 
 
@@ -260,10 +269,10 @@ def _statistics(phi: Float[Array, "n m"], failed: Bool[Array, " n"]) -> Array:
     # squares neither overflow nor underflow.
     scaled_deviations = deviations / jnp.where(largest > 0, largest, 1)
     scaled_std = jnp.sqrt(mean_of_good(scaled_deviations**2))
-    r = heaviness(largest=1, s=scaled_std, n=num_good, numpy=jnp)
+    heaviness_of_phi = heaviness(largest=1, s=scaled_std, n=num_good, numpy=jnp)
     # Deviations that are only rounding errors, or zero, do not count as heavy tails.
     is_random = largest > ROUNDING * jnp.finfo(phi.dtype).eps * jnp.abs(mean)
-    return jnp.stack([mean, jnp.where(is_random, r, 0), largest])
+    return jnp.stack([mean, jnp.where(is_random, heaviness_of_phi, 0), largest])
 
 
 class WordLayout(NamedTuple):

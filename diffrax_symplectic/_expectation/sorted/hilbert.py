@@ -35,7 +35,8 @@ def hilbert_order(
     # On CPUs XLA sorts a single array of unsigned integers ten times as fast as anything
     # else. So with 64 bits one integer holds both the place of a state and its row.
     row_bits = (n - 1).bit_length() if has_64_bits else 0
-    # The highest bit marks the rows at the end.
+    # The lowest bits hold the row and the highest bit marks the rows at the end, so a place
+    # has the bits between.
     place_bits = np.iinfo(dtype).bits - 1 - row_bits
     # Coordinates for which no bit is left are dropped.
     d = min(num_coordinates, place_bits)
@@ -83,11 +84,11 @@ def _places_on_curve(
     coordinate the numbers of the cells along its axis, integers of `bits` bits."""
     # In one dimension the curve is a line, so the place is the coordinate.
     transposed = cells if len(cells) == 1 else _transposed_place(cells, bits)
-    # Collect the bits of the place, the highest first, from the numbers in turn.
+    # Collect the bits of the place, the highest first, from all coordinates in turn.
     places = jnp.zeros(transposed[0].shape, dtype)
     for b in range(bits - 1, -1, -1):
-        for number in transposed:
-            bit = ((number >> np.uint32(b)) & np.uint32(1)).astype(dtype)
+        for coordinate in transposed:
+            bit = ((coordinate >> np.uint32(b)) & np.uint32(1)).astype(dtype)
             places = (places << np.asarray(1, dtype)) | bit
     return places
 

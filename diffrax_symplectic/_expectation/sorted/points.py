@@ -140,17 +140,30 @@ def num_seeds(dimension: int) -> int:
 
 
 def scrambled(
-    points: UInt32[Array, "n d"], seeds: UInt32[Array, " s"]
-) -> UInt32[Array, "n d"]:
+    points: UInt32[Array, "n d"],
+    seeds: UInt32[Array, " s"],
+    indices: UInt32[Array, " k"] | None = None,
+) -> UInt32[Array, "k d"]:
     """Scrambles the points of `sobol_points` by the seeds, which are `num_seeds(d)` random
-    words. Each word of the result is uniformly distributed.
+    words. Each word of the result is uniformly distributed. By `indices`, row `k` of the
+    result is point `indices[k]` of the scrambled ones.
 
-    The indices of the points are scrambled as well as their coordinates. Otherwise
-    neighbours would have complementary coordinates in the same order everywhere, and errors
-    that alternate along the sorted paths would add up.
+    The indices of the points are scrambled first, and then the coordinates of the points
+    with these indices. Otherwise neighbours would have complementary coordinates in the
+    same order everywhere, and errors that alternate along the sorted paths would add up.
     """
-    indices = jnp.arange(len(points), dtype=jnp.uint32)
-    return _scrambled_points(points, indices, seeds)
+    if indices is None:
+        indices = jnp.arange(len(points), dtype=jnp.uint32)
+    n, d = points.shape
+    # An index below `n`, a power of two, has `n.bit_length() - 1` of the 32 bits of a word.
+    # Scrambling keeps it below `n` if its bits are the leading ones.
+    unused_bits = np.uint32(33 - n.bit_length())
+    leading = nested_scramble(indices << unused_bits, seeds[0])
+    scrambled_indices = leading >> unused_bits
+    chosen_points = points[scrambled_indices.astype(jnp.int32)]
+    words = nested_scramble(chosen_points, seeds[1 : d + 1])
+    # The hash alone is not exactly uniform over all seeds. A digital shift makes it so.
+    return words ^ seeds[d + 1 : 2 * d + 1]
 
 
 def balanced_in_sixths(
@@ -177,29 +190,10 @@ def balanced_in_sixths(
     positions = jnp.arange(_BLOCK * num_blocks, dtype=jnp.uint32)
     # The points in turn, beginning again after the last. (`n` is a power of two.)
     indices = (positions + first_index) & np.uint32(n - 1)
-    words = _scrambled_points(points, indices, seeds)
+    words = scrambled(points, seeds, indices)
     blocks = words.reshape(num_blocks, _BLOCK)
     is_smallest = blocks == jnp.min(blocks, axis=1, keepdims=True)
     is_largest = blocks == jnp.max(blocks, axis=1, keepdims=True)
     middle_or_last = jnp.where(is_largest, np.uint32(2**32 - 1), np.uint32(2**31))
     balanced = jnp.where(is_smallest, np.uint32(0), middle_or_last).reshape(-1, d)
     return lax.dynamic_slice_in_dim(balanced, position_in_block.astype(jnp.int32), n)
-
-
-def _scrambled_points(
-    points: UInt32[Array, "n d"],
-    indices: UInt32[Array, " k"],
-    seeds: UInt32[Array, " s"],
-) -> UInt32[Array, "k d"]:
-    """Scrambles these indices, takes the points with the scrambled indices, and scrambles
-    their coordinates."""
-    n, d = points.shape
-    # An index below `n`, a power of two, has `n.bit_length() - 1` of the 32 bits of a word.
-    # Scrambling keeps it below `n` if its bits are the leading ones.
-    unused_bits = np.uint32(33 - n.bit_length())
-    leading = nested_scramble(indices << unused_bits, seeds[0])
-    scrambled_indices = leading >> unused_bits
-    chosen_points = points[scrambled_indices.astype(jnp.int32)]
-    words = nested_scramble(chosen_points, seeds[1 : d + 1])
-    # The hash alone is not exactly uniform over all seeds. A digital shift makes it so.
-    return words ^ seeds[d + 1 : 2 * d + 1]
