@@ -47,7 +47,7 @@ from ._terms import (
 # With any higher order it is less.
 _REFERENCE_STEPS = 8
 # The number of the batch of paths for which the reference is solved. Strong errors of all
-# solvers are measured along these paths.
+# solvers are measured along these paths. (The batches for times begin with number 1.)
 _COMMON_BATCH = 0
 # A quotient of times counts as a whole number if it differs from one by less than this.
 _TIME_ROUNDING = 1e-6
@@ -202,7 +202,7 @@ def compare_solvers(
     Diffrax solver.
     """
     key = checked_key("compare_solvers", key, (terms, y0, args))
-    num_paths = whole_number("num_paths", num_paths, 2)
+    num_paths = whole_number("num_paths", num_paths, least=2)
     dts = _checked_dts(t0, t1, dt0)
     want = "strong" if phi is None else "weak"
     terms = shapes_as_paths(terms)
@@ -210,8 +210,7 @@ def compare_solvers(
     bytes_of_state = sum(jnp.asarray(leaf).nbytes for leaf in jtu.tree_leaves(y0))
     check_memory("num_paths", num_paths, bytes_of_state)
     reference = suggestions[0].solver if reference is None else reference
-    if solvers is None:
-        solvers = [s.solver for s in suggestions]
+    solvers = [s.solver for s in suggestions] if solvers is None else solvers
     _check_solvers(solvers, reference)
     if phi is not None:
         _check_scalar(phi, t1, y0, args)
@@ -223,49 +222,47 @@ def compare_solvers(
     def keys(batch_number: int) -> Key[Array, " num_paths"]:
         return jr.split(jr.fold_in(key, batch_number), num_paths)
 
-    def solve_along_own_path(solver: diffrax.AbstractSolver) -> _SolveBatch:
+    # Common paths are the same Brownian motion for all solvers. (A solver that cannot use
+    # them is refused.) Own paths are those that a solver makes itself, which may take less
+    # time to sample.
+    #
+    # |                           | `want="strong"` | `want="weak"` |
+    # | ------------------------- | --------------- | ------------- |
+    # | times are measured along  | own paths       | own paths     |
+    # | errors are measured along | common paths    | own paths     |
+    def solve_along_own(solver: diffrax.AbstractSolver) -> _SolveBatch:
         return solve_along(solver, ft.partial(own_path, solver, want))
 
-    def solve_to_compare(solver: diffrax.AbstractSolver) -> _SolveBatch:
-        # Strong errors need a common Brownian motion, which not all solvers can use.
-        if want == "strong":
-            return solve_along(solver, ft.partial(common_path, solver, reference_dt))
-        return solve_along_own_path(solver)
+    def solve_along_common(solver: diffrax.AbstractSolver) -> _SolveBatch:
+        return solve_along(solver, ft.partial(common_path, solver, reference_dt))
 
+    solve_for_errors = solve_along_common if want == "strong" else solve_along_own
     common_keys = keys(_COMMON_BATCH)
     # Step sizes are arrays: for a Python number the program would compile anew.
-    exact = solve_to_compare(reference)(common_keys, jnp.asarray(reference_dt))
+    exact = solve_for_errors(reference)(common_keys, jnp.asarray(reference_dt))
     # The results are traced if a function of the user closes over traced values.
     check_untraced("`compare_solvers`", exact)
     steps = []
     refused = {}
     for solver in solvers:
         name = repr(solver)
-        compared_solve = solve_to_compare(solver)
-        refusal = _refusal(compared_solve, common_keys, jnp.asarray(dts[0]))
+        error_solve = solve_for_errors(solver)
+        refusal = _refusal(error_solve, common_keys, jnp.asarray(dts[0]))
         if refusal is not None:
             refused[name] = refusal
             continue
-        # Times are measured along the solver's own path, since a common one may take
-        # longer. Weak errors are measured along the own path, too.
-        timed_solve = compared_solve if want == "weak" else solve_along_own_path(solver)
+        timed_solve = solve_along_own(solver) if want == "strong" else error_solve
         # The first call compiles, and is not timed.
         jax.block_until_ready(timed_solve(keys(1), jnp.asarray(dts[0])))
-        # Each step size has a batch of its own, since weak errors are from independent
-        # paths.
+        # Weak errors are from independent paths, so each step size has its own batch.
         for batch_number, dt in enumerate(dts, start=1):
-            keys_of_batch = keys(batch_number)
             dt_array = jnp.asarray(dt)
-            begin = time.perf_counter()
-            results = jax.block_until_ready(timed_solve(keys_of_batch, dt_array))
-            seconds = (time.perf_counter() - begin) / num_paths
+            results, seconds = _timed(timed_solve, keys(batch_number), dt_array)
             if want == "strong":
-                # Strong errors are measured along the paths of the reference.
-                along_reference = compared_solve(common_keys, dt_array)
-                error, std_error, num_failed = strong_error(along_reference, exact)
+                error = strong_error(error_solve(common_keys, dt_array), exact)
             else:
-                error, std_error, num_failed = weak_error(results, exact)
-            steps.append(ComparedStep(name, dt, error, std_error, seconds, num_failed))
+                error = weak_error(results, exact)
+            steps.append(ComparedStep(name, dt, seconds=seconds, **error._asdict()))
     return Comparison(want, tuple(steps), refused)
 
 
@@ -279,8 +276,8 @@ def _solve_batch(
     solver: diffrax.AbstractSolver,
     make_path: Callable,
 ) -> _SolveBatch:
-    """A compiled function that solves for a batch of paths by one solver. Brownian paths
-    from `make_path(shape, key)` take the place of those of the terms (see `with_paths`)."""
+    """Returns a compiled function that solves for a batch of paths by one solver, each with
+    Brownian paths `make_path(shape, key)` in place of those of the terms."""
     solver = with_programs(solver, t0, y0, args)
     # Terms that share a Brownian motion have equal numbers, and get the same new path.
     numbers = motion_numbers(random_paths(terms))
@@ -288,9 +285,9 @@ def _solve_batch(
     @eqx.filter_jit
     @lapack_in_turn
     @ft.partial(jax.vmap, in_axes=(0, None))
-    def results(key: PRNGKeyArray, dt: Array) -> PathResults:
-        # Increments are not truncated. So a step may have no solution, and the path fails,
-        # and is counted as failed.
+    def solve_path(key: PRNGKeyArray, dt: Array) -> PathResults:
+        # Increments are not truncated, so the equations of an implicit step may have no
+        # solution. The path then counts as failed.
         own_terms = with_paths(make_path, numbers, terms, key)
         check_stratonovich(own_terms, solver, t0, y0, args)
         sol = diffrax.diffeqsolve(
@@ -301,14 +298,14 @@ def _solve_batch(
         result = y1 if phi is None else phi(t1, y1, args)
         return PathResults(result, diffrax.is_okay(sol.result))
 
-    return results
+    return solve_path
 
 
 def _refusal(
     solve_batch: _SolveBatch, keys: Key[Array, " num_paths"], dt: Array
 ) -> str | None:
-    """Why a solver does not accept the terms; `None` if it does."""
-    # Solvers refuse terms by errors while tracing, so nothing need be compiled.
+    """The reason for which a solver does not accept the terms; `None` if it does."""
+    # Solvers raise these errors while JAX traces them, so nothing need be compiled.
     try:
         eqx.filter_eval_shape(solve_batch, keys, dt)
     except ValueError as error:
@@ -316,38 +313,54 @@ def _refusal(
     return None
 
 
-def strong_error(compared: PathResults, exact: PathResults) -> tuple[float, float, int]:
-    """The root mean square of the difference between two solutions along the same paths,
-    its standard error, and the number of failed paths: those that one of the solvers does
-    not finish, which are excluded."""
+def _timed(
+    solve_batch: _SolveBatch, keys: Key[Array, " num_paths"], dt: Array
+) -> tuple[PathResults, float]:
+    """The results of a batch of paths, and the time per path in seconds."""
+    begin = time.perf_counter()
+    results = jax.block_until_ready(solve_batch(keys, dt))
+    return results, (time.perf_counter() - begin) / len(keys)
+
+
+class MeasuredError(NamedTuple):
+    """The error of a batch of paths: the fields of the same names of `ComparedStep`."""
+
+    error: float
+    std_error: float
+    num_failed: int
+
+
+def strong_error(compared: PathResults, exact: PathResults) -> MeasuredError:
+    """The root mean square of the difference between two solutions along the same paths.
+    Paths on which one of the two solvers fails are excluded, and counted as failed."""
     okay = np.asarray(compared.okay & exact.okay)
 
     def squared_differences(y: Array, exact_y: Array) -> np.ndarray:
         return np.asarray(y - exact_y, np.float64).reshape(len(okay), -1) ** 2
 
-    # For each leaf of the state: (paths, entries).
-    leaves = jtu.tree_leaves(
-        jtu.tree_map(squared_differences, compared.results, exact.results)
-    )
-    squares = np.concatenate(leaves, axis=1).sum(axis=1)
+    # Each leaf of the state has squares of shape (paths, entries).
+    of_leaves = jtu.tree_map(squared_differences, compared.results, exact.results)
+    squares = np.concatenate(jtu.tree_leaves(of_leaves), axis=1).sum(axis=1)
     mean_square, std_error_of_mean_square = _mean_and_std_error(squares, okay)
     root_mean_square = math.sqrt(mean_square)
     # The standard error of sqrt(x) is that of x, times the derivative 1 / (2 sqrt(x)). If
     # there is no difference at all, 0 / 0 makes it NaN.
     with np.errstate(all="ignore"):
         std_error = np.divide(std_error_of_mean_square, 2 * root_mean_square)
-    return root_mean_square, float(std_error), int(np.sum(~okay))
+    return MeasuredError(root_mean_square, float(std_error), int(np.sum(~okay)))
 
 
-def weak_error(compared: PathResults, exact: PathResults) -> tuple[float, float, int]:
-    """The absolute difference between the means of two solutions along independent paths,
-    its standard error, and the number of failed paths of the compared solver."""
+def weak_error(compared: PathResults, exact: PathResults) -> MeasuredError:
+    """The absolute difference between the means of two solutions along independent paths.
+    Failed paths of either solution are excluded, and those of `compared` are counted."""
     mean, std_error = _mean_and_std_error(compared.results, compared.okay)
     exact_mean, exact_std_error = _mean_and_std_error(exact.results, exact.okay)
-    # The variances of means from independent paths add up.
-    std_error_of_difference = math.hypot(std_error, exact_std_error)
-    num_failed = int(np.sum(~np.asarray(compared.okay)))
-    return abs(mean - exact_mean), std_error_of_difference, num_failed
+    return MeasuredError(
+        error=abs(mean - exact_mean),
+        # The variances of means from independent paths add up.
+        std_error=math.hypot(std_error, exact_std_error),
+        num_failed=int(np.sum(~np.asarray(compared.okay))),
+    )
 
 
 def _mean_and_std_error(values: Any, okay: Any) -> tuple[float, float]:
@@ -362,8 +375,8 @@ def _mean_and_std_error(values: Any, okay: Any) -> tuple[float, float]:
 
 
 def _check_solvers(solvers: Any, reference: Any) -> None:
-    """Raises a `ValueError` unless `solvers` is a list of solvers, and `reference` is a
-    solver."""
+    """Raises a `ValueError` unless `solvers` is a list of one or more solvers, and
+    `reference` is a solver."""
     is_list = isinstance(solvers, Sequence) and not isinstance(solvers, str)
     if not is_list or len(solvers) == 0:
         raise ValueError(
@@ -390,6 +403,7 @@ def _checked_dts(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
     """The step sizes `dts`, as Python numbers. Raises a `ValueError` unless each is
     positive, divides the interval, and is a multiple of the smallest. (Brownian increments
     over the smallest step are added up to those over longer steps.)"""
+    # With `not`, NaN is refused, too: comparisons with NaN are false.
     if not t1 > t0:
         raise ValueError(f"`t1` must be after `t0`; got t0={t0!r} and t1={t1!r}.")
     if np.ndim(dts) != 1 or len(dts) == 0:
@@ -409,5 +423,5 @@ def _checked_dts(t0: float, t1: float, dts: Sequence[float]) -> list[float]:
 
 def _is_whole(x: float) -> bool:
     """Whether `x` is a positive whole number, up to rounding."""
-    # `round` makes zero of numbers up to a half.
+    # Numbers up to a half are excluded, since they are rounded to zero.
     return math.isfinite(x) and x > 0.5 and abs(x - round(x)) < _TIME_ROUNDING

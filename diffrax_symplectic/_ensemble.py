@@ -76,26 +76,27 @@ class Ensemble(eqx.Module):
         return y0, self._problem.with_args(own_args).args
 
     def _key_of(self, number: IntScalarLike) -> PRNGKeyArray:
-        """The random key of path number `number`."""
+        """The random key of path number `number`. Raises a `ValueError` unless the number
+        is an integer, and not negative. (The sign of traced numbers is not known.)"""
+        is_scalar = eqx.is_array_like(number) and jnp.shape(number) == ()
+        if not is_scalar or not jnp.issubdtype(jnp.result_type(number), jnp.integer):
+            raise ValueError(
+                f"`number` must be one integer, 0 or larger; got {brief(number)}. For "
+                "several paths, batch over their numbers: `jax.vmap(paths.start)(numbers)`."
+            )
+        if not is_traced(number):
+            number = whole_number("number", int(number), least=0)
         return sample_key(self._key, *_high_and_low(number))
 
 
 def _high_and_low(number: IntScalarLike) -> tuple[ArrayLike, ArrayLike]:
-    """The high and the low 32 bits of the number of a path. Raises a `ValueError` unless
-    the number is an integer, and not negative. (The sign of traced numbers is not known.)
-    """
-    is_scalar = eqx.is_array_like(number) and jnp.shape(number) == ()
-    if not is_scalar or not jnp.issubdtype(jnp.result_type(number), jnp.integer):
-        raise ValueError(
-            f"`number` must be one integer, 0 or larger; got {brief(number)}. For several "
-            "paths, batch over their numbers: `jax.vmap(paths.start)(numbers)`."
-        )
+    """The high and the low 32 bits of an integer that is not negative: a traced one, or an
+    `int` of Python, which may have more bits than integers of JAX."""
     if not is_traced(number):
-        # Python divides, since its integers may have more bits than those of JAX.
-        high, low = divmod(whole_number("number", int(number), least=0), 2**32)
+        high, low = divmod(number, 2**32)
         return np.uint32(high), np.uint32(low)
     traced_number = jnp.asarray(number)
-    # If the integer type has 32 bits or fewer, XLA's shift by 32 gives zero, as it should.
+    # The shift gives zero, as it should, if the integer type has 32 bits or fewer.
     return (traced_number >> 32).astype(jnp.uint32), traced_number.astype(jnp.uint32)
 
 
@@ -183,8 +184,8 @@ def ensemble(
         raise ValueError(f"`want` must be one of {get_args(Want)}; got {want!r}.")
     with ShortTraceback():
         problem = Problem.of(
-            state_itself, terms, solver, t0, t1, dt0, y0, args,
-            ts=[t1] if ts is None else ts, levels=1, want=want, caller="ensemble", key=key,
+            state_itself, terms, solver, t0, t1, dt0, y0, args, ts,
+            levels=1, want=want, caller="ensemble", key=key,
         )  # fmt: skip
     if want == "strong" and any(which_are_shapes(terms)):
         check_gaussian(solver)
@@ -194,27 +195,18 @@ def ensemble(
     if batch_size is None:
         batch_size = _default_batch_size(problem, engine)
     batch_size = min(whole_number("batch_size", batch_size), num_paths)
-    batches = []
-    for first in range(0, num_paths, batch_size):
-        # JAX would compile anew for a last batch of another size, so it simulates a whole
-        # batch, of which `_concatenated` drops the rest.
-        num_left = num_paths - first
-        size = batch_size if engine == "jax" else min(batch_size, num_left)
-        sample_numbers = np.arange(first, first + size, dtype=np.uint64)
-        batches.append(ENGINES[engine](problem, key, sample_numbers))
-    all_paths = _concatenated(batches, num_paths, at_end=ts is None)
+    all_paths = _in_batches(problem, key, num_paths, batch_size, engine)
     num_failed = int(np.sum(all_paths.failed))
     if num_failed > 0:
-        advice = advice_on_failures(problem)
         warnings.warn(
             f"{num_failed:,} of {num_paths:,} paths failed. Their states are NaN: select "
-            f"the others with `~failed`. {advice}",
+            f"the others with `~failed`. {advice_on_failures(problem)}",
             stacklevel=2,
         )
     warn_of_stragglers(all_paths.num_stragglers, num_failed, num_paths, stacklevel=2)
     # The times at which steps end. (The times in `ts` may differ from these by rounding.)
-    saved_steps = np.asarray(problem.levels.saved_steps[0])
-    saved_times = float(problem.t0) + saved_steps * float(problem.levels.h[0])
+    level = problem.level(0)
+    saved_times = float(problem.t0) + np.asarray(level.saved_steps) * float(level.h)
     return Ensemble(
         ts=saved_times,
         ys=all_paths.y,
@@ -234,16 +226,26 @@ def _default_batch_size(problem: Problem, engine: str) -> int:
     return max(_FEWEST_PATHS, num_entries // problem.num_components)
 
 
-def _concatenated(batches: list[Batch], num_paths: int, at_end: bool) -> Batch:
-    """The first `num_paths` paths of all batches as one batch, with NaN for the states of
-    failed paths. If the states were wanted `at_end` only, there is no axis of times."""
+def _in_batches(
+    problem: Problem, key: PRNGKeyArray, num_paths: int, batch_size: int, engine: str
+) -> Batch:
+    """The paths with the numbers from 0 to `num_paths - 1`, simulated in batches, as one
+    `Batch`. The states of failed paths are NaN. If states are wanted at `t1` only, they
+    have no axis of times."""
+    batches = []
+    for first in range(0, num_paths, batch_size):
+        # JAX would compile anew for a last batch of another size. So it simulates a whole
+        # batch, and paths with numbers from `num_paths` on are dropped below.
+        size = batch_size if engine == "jax" else min(batch_size, num_paths - first)
+        sample_numbers = np.arange(first, first + size, dtype=np.uint64)
+        batches.append(ENGINES[engine](problem, key, sample_numbers))
     failed = np.concatenate([batch.failed for batch in batches])[:num_paths]
 
     def concatenate(*leaves: np.ndarray) -> np.ndarray:
         # (paths, times, ...)
         states = np.concatenate(leaves)[:num_paths]
         states[failed] = np.nan
-        return states[:, 0] if at_end else states
+        return states[:, 0] if problem.at_end else states
 
     y = jtu.tree_map(concatenate, *[batch.y for batch in batches])
     return Batch(y, failed, sum(batch.num_stragglers for batch in batches))

@@ -58,13 +58,11 @@ _MOST_LOST_VARIANCE = 1e-3
 
 
 def checked_key(caller: str, key: Any, others: Any) -> PRNGKeyArray:
-    """The key that `caller` was called with, as a typed key. Raises a `ValueError` unless
-    it is one random key, and if arrays in it or in `others`, the other arguments of
-    `caller`, are traced."""
-    # Inside `jit` any new array is traced, so a new array tells whether `caller` is called
-    # inside `jit` even if no argument is traced. Functions that close over traced values of
-    # other transformations are found later, when a result that depends on these values is
-    # read.
+    """The random key that the user passed to the function `caller`, as a typed key. Raises
+    a `ValueError` unless it is a single key, and if `caller` was called inside a
+    transformation of JAX. `others` are the other arguments of `caller`."""
+    # Inside `vmap` or `grad` an argument is traced. Inside `jit` perhaps none is, but any
+    # new array is.
     new_array = jnp.zeros(())
     check_untraced(f"`{caller}`", (key, others, new_array))
     check_key(key, caller)
@@ -96,14 +94,15 @@ def step_numbers(
             f"`dt0` must be positive, and `t1` after `t0`; got {arguments}."
         )
     times = np.array([end] if ts is None else ts, float).reshape(-1)
-    # The numbers of steps, up to rounding.
     quotients = (np.append(times, end) - begin) / step
     counts = np.round(quotients)
     roundings = _TIME_ROUNDING * np.maximum(counts, 1)
-    # For times that are NaN, `np.any(... > roundings)` would be false.
+    # `not np.all(... <= ...)` also finds times that are NaN, for which comparisons are
+    # false.
     if not np.all(np.abs(quotients - counts) <= roundings):
         example = ""
-        # With times before the end, one step size may not divide all intervals.
+        # There is no example with times before the end: one step size may not divide all
+        # intervals.
         if np.all(times == end):
             num_steps = max(1, np.ceil(quotients[-1]))
             example = f" For example, `dt0={end - begin:g} / {num_steps:.0f}`."
@@ -197,8 +196,9 @@ def warn_of_truncation(terms: PyTree, h: float, stacklevel: int) -> None:
 def has_discrete_increments(solver: diffrax.AbstractSolver) -> bool:
     """Whether a solver takes discrete increments only, as weak methods do. Such a solver
     makes a path with discrete increments even for `want="strong"`."""
-    path = own_path(solver, "strong", (), jr.key(0))
-    # The laws of a path are unknown if its class is the user's.
+    path = own_path(solver, "strong", shape=(), key=jr.key(0))
+    # The laws of the random variables of a step, of which `W` is the increment. The laws
+    # are unknown (`None`) if the class of the path is the user's.
     laws = laws_of(path) or {}
     return isinstance(laws.get("W"), Discrete)
 
@@ -215,10 +215,10 @@ def check_gaussian(solver: diffrax.AbstractSolver) -> None:
 
 
 def check_cells(terms: PyTree, t0: float, h: float) -> None:
-    """Raises a `ValueError` unless steps of size `h` from `t0` on are made up of whole
-    cells of all paths that have cells."""
+    """Raises a `ValueError` unless `t0` and the step size `h` are multiples of the `cell`
+    of each path. A path with `cell` is sampled over intervals of this length."""
     for path in brownian_paths(terms):
-        # Many classes of paths have no cells, and others have them on request only.
+        # Many classes of paths have no `cell`, and in others it may be `None`.
         cell = getattr(path, "cell", None)
         if cell is None:
             continue
@@ -246,13 +246,6 @@ def state_itself(t, y, args):
     return y
 
 
-def _real_phi(phi: Callable, t: RealScalarLike, y: Y, args: Args) -> PyTree[Array]:
-    """The values of the user's `phi`. Raises an error unless they are real arrays."""
-    values = call_user_function("phi", phi, t, y, args=args)
-    check_real("phi", jtu.tree_leaves(values))
-    return values
-
-
 def traced_phi(
     phi: Callable, terms: PyTree, t0: Float[np.ndarray, ""], y0: Y, args: Args
 ) -> Callable[[RealScalarLike, Y, Args], PyTree]:
@@ -266,10 +259,17 @@ def traced_phi(
         return traced(jtu.Partial(_real_phi, phi), t0, y0, args, identity=phi)
     except (TypeError, AttributeError, IndexError) as error:
         # A user may take the pair `y` for the spin `s` itself, and write `s.x`, `s[2]` or
-        # `-s`.
+        # `-s`, which raise these errors.
         if has_lifted(terms):
             error.add_note(
                 "For spins and complex amplitudes `phi(t, y, args)` gets the pair "
                 "`(p, q)`: call `from_spinors(y)` or `from_pair(y)` in it."
             )
         raise
+
+
+def _real_phi(phi: Callable, t: RealScalarLike, y: Y, args: Args) -> PyTree[Array]:
+    """The values of the user's `phi`. Raises an error unless they are real arrays."""
+    values = call_user_function("phi", phi, t, y, args=args)
+    check_real("phi", jtu.tree_leaves(values))
+    return values

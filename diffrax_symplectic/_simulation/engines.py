@@ -48,9 +48,9 @@ _IN_TURN = threading.RLock()
 def warn_of_stragglers(
     num_stragglers: int, num_failed: int, num_paths: int, stacklevel: int
 ) -> None:
-    """Warns if JAX simulated many paths again, and with success."""
-    # Failed paths are stragglers that JAX could not solve either. Failed paths do not
-    # count, since the warning advises `engine="jax"`, by which they would fail, too.
+    """Warns if the fused kernel did not finish many paths that JAX then did finish."""
+    # Failed paths are stragglers that JAX could not solve either. They do not count, since
+    # the warning advises `engine="jax"`, by which they would fail, too.
     num_rescued = num_stragglers - num_failed
     if num_rescued > _LARGEST_SHARE_OF_STRAGGLERS * num_paths:
         warnings.warn(
@@ -79,8 +79,8 @@ class Batch(NamedTuple):
 def by_jax(
     problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int = 0
 ) -> Batch:
-    """The paths with these sample numbers on one level, simulated by JAX. The loop over
-    steps always runs all levels of the problem. The other levels are dropped."""
+    """The paths with these sample numbers on one level, simulated by JAX. (All levels of
+    the problem are simulated, and the others are dropped.)"""
     states_and_failed = _paths_by_jax(problem, key, _high_and_low(sample_numbers))
     # The results are traced if a function of the user closes over traced values.
     check_untraced("`ensemble`", states_and_failed)
@@ -89,8 +89,8 @@ def by_jax(
 
 
 def _high_and_low(sample_numbers: np.ndarray) -> UInt32[np.ndarray, "2 n"]:
-    """The high and the low 32 bits of 64-bit numbers, since JAX may have no 64-bit
-    integers. The parameter `words` of functions below is such an array."""
+    """The high and the low 32 bits of 64-bit numbers, as the two rows of an array, since
+    JAX may have no 64-bit integers. The parameter `words` below is such an array."""
     high = sample_numbers >> np.uint64(32)
     low = sample_numbers & np.uint64(0xFFFFFFFF)
     return np.stack([high, low]).astype(np.uint32)
@@ -99,7 +99,7 @@ def _high_and_low(sample_numbers: np.ndarray) -> UInt32[np.ndarray, "2 n"]:
 def _sample_keys(
     key: PRNGKeyArray, words: UInt32[Array | np.ndarray, "2 n"]
 ) -> Key[Array, " n"]:
-    """The random keys of the samples whose numbers have the bits `words`."""
+    """The random keys of samples, whose numbers have the high and low bits `words`."""
     return jax.vmap(ft.partial(sample_key, key))(*words)
 
 
@@ -141,6 +141,7 @@ def by_drjit(
             f'`engine="drjit"` needs Dr.Jit. {error}; or pass `engine="jax"`, which needs '
             "nothing else."
         ) from error
+    # Dr.Jit raises a `RuntimeError` if an error is raised in what it records.
     except (NotReplayed, RuntimeError) as error:
         refusal = _refusal(error)
         if refusal is None:
@@ -155,25 +156,23 @@ def by_drjit(
 def _fused_batch(
     problem: Problem, key: PRNGKeyArray, sample_numbers: np.ndarray, level: int
 ) -> Batch:
-    """The paths of a batch by the kernel alone. Paths that it did not finish count as
-    failed."""
+    """The paths of a batch, simulated by the kernel alone: stragglers count as failed. The
+    kernel is called for all steps up to one saved time, then for those up to the next."""
     kernels, lanes, shared = fused_start(problem, key, sample_numbers, level)
     saved_steps = np.asarray(problem.level(level).saved_steps)
-    # The kernel is called once for all steps from one saved time to the next. For each
-    # number of steps to a saved time, the states at this time: (paths, entries of the
-    # state).
+    # From the number of steps to a saved time, to the states of shape (paths, entries).
     states_after: dict[int, np.ndarray] = {}
     num_steps_done = 0
     for num_steps in np.unique(saved_steps).tolist():
-        # There is no step to take if the saved time is `t0`.
+        # There is no step to take to a saved time that is `t0`.
         if num_steps > num_steps_done:
             lanes = kernels.advance(lanes, shared, num_steps_done, num_steps)
         num_steps_done = num_steps
         states_after[num_steps] = np.stack([*map(np.asarray, lanes.y)], axis=-1)
-    # (paths, times, entries of the state). `ts` may be in any order, and repeat a time.
+    # (paths, times, entries). Saved times may be in any order, and may be repeated.
     states = np.stack([states_after[step] for step in saved_steps.tolist()], axis=1)
-    # The mask is copied, so that no array of Dr.Jit outlives this call, during which no
-    # other thread uses Dr.Jit.
+    # The mask is copied, since no array of Dr.Jit may outlive this call: afterwards another
+    # thread may use Dr.Jit.
     is_unfinished = np.array(lanes.stopped)
     return Batch(
         y=Layout.of(problem.y0).unravel(states),
@@ -213,8 +212,9 @@ def _kernels_and_arrays(
     problem: Problem, key: PRNGKeyArray
 ) -> tuple[Kernels, list[Array]]:
     """The kernels of a problem, and the arrays in it, which are inputs of the kernels."""
-    # Kernels have plain sweeps for root finders. Step sizes, times and numbers of steps are
-    # inputs of a kernel, so placeholders stand for them when it is compiled.
+    # Kernels solve the equations of implicit steps by plain sweeps. They get step sizes,
+    # times and numbers of steps as inputs. So placeholders stand for them here, and
+    # problems that differ only in these have the same kernels.
     zero = jnp.zeros(1, jnp.int32)
     any_h = jnp.ones_like(problem.levels.h[:1])
     compiled_problem = dataclasses.replace(
@@ -247,17 +247,17 @@ def _with_stragglers(
     level: int,
     fused: Batch,
 ) -> Batch:
-    """The batch `fused`, whose stragglers (one or more) are replaced by paths that JAX
-    simulates."""
+    """The batch `fused` with its stragglers, of which there are one or more, replaced by
+    the same paths as simulated by JAX."""
     (stragglers,) = np.nonzero(fused.failed)
     num_stragglers = len(stragglers)
-    # JAX compiles a program for each number of paths. So that there are few, stragglers are
-    # repeated until their number is a power of four.
+    # JAX compiles a program for each number of paths. So that there are few such numbers,
+    # stragglers are repeated until there are a power of four, or as many as in the batch.
     power_of_four = 4 ** int(np.ceil(np.log(num_stragglers) / np.log(4)))
     num_to_solve = min(len(sample_numbers), power_of_four)
     repeated_stragglers = np.resize(stragglers, num_to_solve)
-    # JAX simulates the paths from their start. To go on from where the kernel stopped, it
-    # would need the solver's state, and would not give the same paths as without a kernel.
+    # JAX simulates the paths from their start, so that they are the same as without a
+    # kernel. To go on from where the kernel stopped, it would also need the solver's state.
     solved = by_jax(problem, key, sample_numbers[repeated_stragglers], level)
 
     def with_solved(fused_leaf: np.ndarray, solved_leaf: np.ndarray) -> np.ndarray:
@@ -274,14 +274,14 @@ def _with_stragglers(
 def _refusal(error: BaseException | None) -> ValueError | None:
     """The error to raise for the user if `error` comes from an operation that Dr.Jit cannot
     replay; `None` if it has another cause, and should be raised as it is."""
-    # Dr.Jit may have raised an error of its own from a `NotReplayed` in what it records.
+    # `error` may be an error of Dr.Jit that was raised from a `NotReplayed`.
     cause = error
     while cause is not None and not isinstance(cause, NotReplayed):
         cause = cause.__cause__ or cause.__context__
     if cause is None:
         return None
-    # The user's function that needs the operation is the first one outside of this package
-    # and of installed ones. JAX may have recorded none.
+    # The user's function that needs the operation is the first one that is neither in this
+    # package nor in an installed one. JAX may not have recorded it.
     origin = ""
     package = str(Path(__file__).parents[1])
     for source in source_lines(cause.location):

@@ -50,28 +50,34 @@ class Layout(NamedTuple):
         return self.treedef.unflatten(arrays)
 
     def labels(self, ts: np.ndarray | None) -> list[str]:
-        """A label for each number of a vector, in their order: its time and its place in
-        the PyTree, such as `t=2, ['energy'][0]`. If there are times but not their values
-        `ts`, the index of the time stands first in the brackets, as in `['energy'][1, 0]`.
-        A single number without a time has an empty label."""
-        tree = self.treedef.unflatten([np.zeros(shape) for shape in self.shapes])
+        """A label for each number of a vector, in order: its time and its indices in `phi`.
+
+        - `t=2, ['energy'][0]`: the usual form, if the times `ts` are known.
+        - `['energy'][1, 0]`: if `ts` is `None` although `phi` has an axis of times. The
+          index of the time stands first in the brackets.
+        - `['energy'][0]`: if `phi` has no axis of times.
+
+        The label is empty for a `phi` that is a single number without a time."""
+        # Only the structure of this `phi` is used, and the shapes of its arrays.
+        phi = self.treedef.unflatten([np.zeros(shape) for shape in self.shapes])
         is_time_an_index = ts is None and self.num_times is not None
         labels = []
         for k in range(1 if self.num_times is None else self.num_times):
             time = "" if ts is None else f"t={ts[k]:.7g}"
-            for keys, leaf in jtu.tree_leaves_with_path(tree):
+            for keys, leaf in jtu.tree_leaves_with_path(phi):
                 for index in np.ndindex(leaf.shape):
                     indices = (k, *index) if is_time_an_index else index
-                    entry = f"[{', '.join(map(str, indices))}]" if indices else ""
-                    place = jtu.keystr(keys) + entry
+                    brackets = f"[{', '.join(map(str, indices))}]" if indices else ""
+                    in_phi = jtu.keystr(keys) + brackets
                     # Either may be empty.
-                    labels.append(", ".join(filter(None, (time, place))))
+                    labels.append(", ".join(filter(None, (time, in_phi))))
         return labels
 
 
 def as_vectors(
     x: Float[Array, "levels times n m"],
 ) -> Float[Array, "levels n numbers"]:
-    """For each level and sample, the `m` numbers at all times as one vector."""
+    """For each level and sample, the `m` numbers of `phi` at each time as one vector of
+    `times * m` numbers."""
     x = jnp.swapaxes(x, 1, 2)
     return x.reshape(*x.shape[:2], -1)

@@ -43,7 +43,7 @@ def levels_of(
     has half the step of the one before. `step_numbers` are the numbers of steps on the
     first level: to each saved time, and last of all to the end. Raises a `ValueError` for
     too many steps."""
-    # The power is a float, since an integer could overflow.
+    # The power of two is a float, since an integer could overflow.
     if step_numbers[-1] * 2.0 ** (levels - 1) >= _STEPS_TOO_MANY:
         raise ValueError(
             f"`levels={levels}` halves `dt0` {levels - 1} times, which is more than "
@@ -120,13 +120,17 @@ def level_weights(
         return best[None]
     best_without_coarsest = np.append(0.0, _extrapolation_weights(order, levels - 1))
     finest = np.eye(levels)[-1]
+    # The last step of an extrapolation adds `change / (2.0**power - 1)`, where the error is
+    # in proportion to h^power and `change` is the change by halving the step. In `BEST`,
+    # `power` is the highest one. Here it is the first one, `order`.
     change = finer_change_weights(order, levels - 1)
     by_first_power = change / (2.0**order - 1)
     rows = [best, finest - best, best - best_without_coarsest, by_first_power]
     if levels > 2:
-        change = finer_change_weights(order, levels - 2)
-        last_change = np.append(0.0, change)
-        change_before = np.append(change, 0.0)
+        # The change from an extrapolation of `levels - 2` levels to the next one.
+        shorter_change = finer_change_weights(order, levels - 2)
+        last_change = np.append(0.0, shorter_change)
+        change_before = np.append(shorter_change, 0.0)
         # An extrapolation from `levels - 2` levels eliminates `levels - 3` powers of the
         # step size from the error. Halving the step divides what remains by 2^power, with
         # the first power that is left.
@@ -153,9 +157,12 @@ def _extrapolation_weights(
 ) -> Float[np.ndarray, " levels"]:
     """The weights of the means on all levels in the extrapolation to step size zero: they
     add up to one, and cancel the first `levels - 1` terms of the error."""
-    # With step h / 2^k on level k, a term in h^power is multiplied by 2^(-power k). The
-    # equation of power 0 is that the weights add up to one. The others are that terms of
-    # the error vanish: powers begin with the order and increase by 1, or for order 1/2 by
+    # With step h / 2^k on level k, a term in h^power is multiplied by 2^(-power k). So the
+    # weights solve, with a sum over the levels k,
+    #
+    #     sum_k 2^(-power k) weight_k = 1 for power 0, and 0 for the powers in the error.
+    #
+    # The powers in the error begin with the order and increase by 1, or for order 1/2 by
     # 1/2.
     powers = np.append(0.0, order + min(order, 1) * np.arange(levels - 1))
     matrix = 2.0 ** -np.outer(powers, np.arange(levels))

@@ -114,39 +114,41 @@ class Simulated(NamedTuple):
     control: Any
 
 
-def _phi_itself(phi: Array, failed: Bool[Array, " n"]) -> Array:
+def _values_alone(values: Array, failed: Bool[Array, " n"]) -> Array:
     """The default of `measure` in `simulate`: saves the values of `phi` as they are."""
     del failed
-    return phi
+    return values
 
 
 def simulate(
     problem: Problem,
     motion_on: Callable[[Level], Motion],
-    measure: Callable[[Array, Bool[Array, " n"]], Array] = _phi_itself,
+    measure: Callable[[Array, Bool[Array, " n"]], Array] = _values_alone,
 ) -> Simulated:
-    """Simulates the paths of all levels, which move as `motion_on(level)` says. At each
-    saved time `measure(phi, failed)` is saved: `phi` has shape `(n, m)`, with the values of
-    `problem.phi` for each of `n` paths, and `failed` says which paths have failed."""
+    """Simulates the paths of all levels, which move as `motion_on(level)` says.
+
+    At each saved time `measure(values, failed)` is saved: `values` has shape `(n, m)`, with
+    the values of `phi` for each of `n` paths, and `failed` says which paths have failed.
+    The loop over steps carries the paths, and an array `saved` with a row for each saved
+    time, which is zero until this time has come."""
 
     def measure_if_saved(
         level: Level, num_steps: Any, paths: PathStates, saved: Float[Array, "S ..."]
     ) -> tuple[PathStates, Float[Array, "S ..."]]:
-        """Adds a measurement to `saved` if the time after `num_steps` steps is a saved one.
-        A path whose `phi` is then not finite has failed, and is marked so in the returned
-        paths."""
+        """If the time after `num_steps` steps is a saved one, writes a measurement to its
+        row of `saved`, and marks paths whose values are not finite as failed."""
 
         def with_measurement():
             t = problem.t0 + num_steps * level.h
 
-            def phi_of_path(y: Y, args: PyTree[Array]) -> Array:
+            def values_of_path(y: Y, args: PyTree[Array]) -> Array:
                 return problem.with_args(args).values(t, y)
 
-            phi = jax.vmap(phi_of_path)(paths.y, paths.args)
-            failed = paths.failed | ~jax.vmap(all_finite)(phi)
+            values = jax.vmap(values_of_path)(paths.y, paths.args)
+            failed = paths.failed | ~jax.vmap(all_finite)(values)
             # `ts` may repeat a time, so several rows of `saved` may belong to this time.
             is_row_of_time = mask_like(level.saved_steps == num_steps, saved)
-            return failed, jnp.where(is_row_of_time, measure(phi, failed), saved)
+            return failed, jnp.where(is_row_of_time, measure(values, failed), saved)
 
         # The predicate is one truth value for all paths. With a value for each path, JAX
         # would evaluate `phi` after every step.
@@ -163,10 +165,11 @@ def simulate(
             paths, saved = carry
             return measure_if_saved(level, i + 1, motion.step(i, paths), saved)
 
+        # The shape of a measurement follows from that of the values.
         num_saves, m = problem.output_shape
         dtype = problem.dtype_of_values
-        phi = jax.ShapeDtypeStruct((len(motion.start.failed), m), dtype)
-        measurement = jax.eval_shape(measure, phi, motion.start.failed)
+        values = jax.ShapeDtypeStruct((len(motion.start.failed), m), dtype)
+        measurement = jax.eval_shape(measure, values, motion.start.failed)
         nothing_saved = jnp.zeros((num_saves, *measurement.shape), dtype)
         # A saved time may be `t0`, before the first step.
         carry = measure_if_saved(level, 0, motion.start, nothing_saved)
@@ -174,8 +177,7 @@ def simulate(
         return Simulated(saved, paths.failed, paths.control)
 
     if len(problem.levels.h) == 1:
-        only_level = simulate_level(problem.level(0))
-        return jtu.tree_map(lambda x: x[None], only_level)
+        return jtu.tree_map(lambda x: x[None], simulate_level(problem.level(0)))
     # All levels share one compiled program.
     return lax.map(simulate_level, problem.levels)
 
@@ -187,10 +189,13 @@ def independent_motion(
     terms_of: Callable[[Any], PyTree],
     randomness_of_step: Callable[[Any], PyTree[Array]],
 ) -> Motion:
-    """The motion of independent paths from `starts`, the results of `Problem.draw_start`.
+    """The motion of paths that move independently of each other.
 
-    `randomness_of_step(i)` is a PyTree of random numbers or keys for step `i`, with a row
-    for each path. In step `i`, a path has the terms `terms_of(row)`, made from its row.
+    - `starts`: the results of `Problem.draw_start` for all paths.
+    - `terms_of`: makes the terms of one path in a step, from its row of random numbers or
+        keys.
+    - `randomness_of_step`: maps the number of a step to these rows, as a PyTree of arrays
+        with a leading axis of paths.
     """
 
     def step(i: Any, paths: PathStates) -> PathStates:
@@ -207,8 +212,8 @@ def independent_motion(
         problem_of_path = problem.with_args(args)
         return problem_of_path.init(terms_of(row), 0, level.h, y)
 
-    # These are made before `PathStates.start` replaces initial states that are not finite.
-    # A path with such a state has failed, so its solver state does not matter.
+    # `PathStates.start` replaces initial states that are not finite only afterwards. The
+    # solver state of such a path does not matter, since the path has failed.
     solver_state = jax.vmap(solver_state_at_start)(randomness_of_step(0), *starts)
     return Motion(step, PathStates.start(problem, starts, solver_state))
 
@@ -236,11 +241,11 @@ def values_of_paths(
 
 
 def _vmapped_in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
-    """The result of `jax.vmap(fn)(*args)`. For many paths on CPUs it is computed for one
-    block of paths after another."""
+    """The result of `jax.vmap(fn)(*args)`, which maps over paths. For many paths on CPUs,
+    one block of `_PATHS_AT_ONCE` paths is computed after another."""
     num_paths = len(jtu.tree_leaves(args)[0])
-    # If blocks of equal size would leave some paths over, there are no blocks, since a
-    # smaller one would need a program of its own.
+    # If whole blocks would leave some paths over, there are no blocks, since a smaller one
+    # would need a program of its own.
     has_whole_blocks = num_paths > _PATHS_AT_ONCE and num_paths % _PATHS_AT_ONCE == 0
     if not has_whole_blocks or jax.default_backend() != "cpu":
         return jax.vmap(fn)(*args)
@@ -255,6 +260,6 @@ def _vmapped_in_blocks(fn: Callable, *args: PyTree[Array]) -> Any:
 
 
 def mask_like(mask: Bool[Array, " n"], x: Array) -> Array:
-    """The mask, which is for the first axis of `x`, with axes of length 1 for the others,
-    so that it broadcasts against `x`."""
+    """A mask for the first axis of `x`, with further axes of length 1, so that it
+    broadcasts against `x`."""
     return mask.reshape(-1, *[1] * (x.ndim - 1))

@@ -122,16 +122,27 @@ class Problem(eqx.Module):
         caller: str = "expectation",
         key: PRNGKeyArray | None = None,
     ) -> "Problem":
-        """The problem of these arguments of the function `caller`. In `terms`, a path of
-        the solver for the purpose `want` takes the place of each shape. Examples of `y0`
-        and `args` are drawn from `key`, which may be any key of the user's random number
-        generator. Raises a `ValueError` for bad arguments."""
-        num_levels = whole_number("levels", levels, 1, MOST_LEVELS)
+        """The problem of these arguments of the function `caller`. Raises a `ValueError`
+        for bad arguments. Examples of `y0` and `args` are drawn from `key`, which may be
+        any key of the user's random number generator.
+
+        The order is:
+
+        1. Types of arguments are checked.
+        2. In `terms`, a path of the solver for the purpose `want` takes the place of each
+           shape. `y0` and `args` become examples if they are functions.
+        3. Programs take the place of the user's functions (see `_as_programs`).
+        4. The terms are checked, with the values of `t0`, `y0` and `args`.
+        5. Paths in `terms` that the solver made are truncated, if its steps need that.
+        6. The steps on all levels are checked.
+        """
+        # 1. Types.
+        num_levels = whole_number("levels", levels, least=1, most=MOST_LEVELS)
         check_terms(terms)
         check_solver("solver", solver)
         check_made_for_noise(solver)
-        # For each path in `terms`, whether the solver makes it.
-        is_made_by_solver = which_are_shapes(terms)
+        # 2. Paths and examples. `made_by_solver` has a flag for each path in `terms`.
+        made_by_solver = which_are_shapes(terms)
         # The paths get keys for an example. In each sample other keys take their place.
         terms = with_paths_for_shapes(terms, ft.partial(own_path, solver, want))
         numbers_of_steps = step_numbers(t0, t1, dt0, ts)
@@ -141,34 +152,38 @@ class Problem(eqx.Module):
         # Times have the dtype of the state.
         dtype = jnp.result_type(*jtu.tree_leaves(y0))
         t0_array = np.asarray(t0, dtype)
+        # 3. Programs.
         phi, terms, solver, y0_of, args = _as_programs(
             phi, terms, solver, y0_of, t0_array, y0, args, key
         )
         # What functions close over is now a part of their programs.
         check_untraced(f"`{caller}`", (phi, terms, solver, y0_of, args_of))
+        # 4. Terms. Assertions and constraints are checked here, where the values of `y0`
+        # are known. In the program of a solve they are traced.
         check_fit(terms, t0_array, y0, args)
-        # Assertions and constraints are checked here, where the values of `y0` are known.
-        # In the program of a solve they are traced.
         check_assertions(terms, t0_array, y0, args)
         if constraint_of(terms) is not None:
             check_start(terms, t0_array, y0, args)
         check_noise(terms)
-        has_root_finder = isinstance(solver, diffrax.AbstractImplicitSolver)
-        if has_root_finder and any(is_made_by_solver):
+        # 5. Truncation. With a very large increment of noise that depends on the state, the
+        # equations of an implicit step may have no solution.
+        if isinstance(solver, diffrax.AbstractImplicitSolver) and any(made_by_solver):
             needed = which_need_truncation(terms, t0_array, y0, args)
             # Paths of the user are kept as they are.
-            which = [made and need for made, need in zip(is_made_by_solver, needed)]
+            which = [made and need for made, need in zip(made_by_solver, needed)]
             # One unit serves all levels. It is an array, so that another one compiles
             # nothing anew.
             unit = _UNIT_OF_TRUNCATION * (float(t1) - float(t0))
             terms = with_truncation(terms, which, np.asarray(unit, dtype))
+        # 6. Steps.
         check_truncation(terms, float(dt0))
         smallest_step = float(dt0) / 2 ** (num_levels - 1)
         if isinstance(solver, AbstractSymplecticSolver):
             check_resolution(smallest_step, float(t0), float(t1), dtype)
         check_stratonovich(terms, solver, t0_array, y0, args, all_terms=True)
         check_cells(terms, float(t0), smallest_step)
-        # First, since it refuses numbers of levels for which weights cannot be computed.
+        # `levels_of` is called before `level_weights`, since it refuses numbers of levels
+        # for which weights cannot be computed.
         all_levels = levels_of(float(dt0), numbers_of_steps, num_levels, dtype)
         weights = level_weights(_order_of(solver, terms), num_levels)
         return Problem(
@@ -210,8 +225,8 @@ class Problem(eqx.Module):
         level = self.level(0)
 
         def times(num_steps: Any) -> np.ndarray:
-            # A time that is reached by steps of another size has another rounding error.
-            # Single precision rounds these errors off.
+            # Equal times have equal hashes: single precision hides rounding errors, which
+            # differ if the same time is reached by steps of another size.
             return np.asarray(self.t0 + num_steps * level.h, np.float32)
 
         arguments = dict(
@@ -238,8 +253,8 @@ class Problem(eqx.Module):
         return self.y0_of is not None or self.args_of is not None
 
     def draw_start(self, key: PRNGKeyArray) -> tuple[Y, PyTree[Array]]:
-        """The initial state of the path with this key, and the arrays in its `args`. In
-        place of the arrays stands `None` if all paths have the same `args`."""
+        """The initial state of the path with this key, and the arrays in its `args`; `None`
+        in place of these arrays if all paths have the same `args`."""
         y0_key, args_key = jr.split(jr.fold_in(key, _START_KEY))
         own_args = None
         if self.args_of is not None:
@@ -250,9 +265,9 @@ class Problem(eqx.Module):
         return y0, own_args
 
     def with_args(self, own_args: PyTree[Array]) -> "Problem":
-        """The problem of a single path: `own_args` are the arrays in its `args`, as from
-        `draw_start`."""
-        if self.args_of is None and own_args is None:
+        """The problem of a single path. `own_args` are the arrays in the `args` of this
+        path, or `None`, as from `draw_start`."""
+        if own_args is None:
             return self
         shared_args = eqx.filter(self.args, eqx.is_array, inverse=True)
         return dataclasses.replace(self, args=eqx.combine(own_args, shared_args))
@@ -274,15 +289,15 @@ class Problem(eqx.Module):
         y: Y,
         solver_state: PyTree[Array],
     ) -> tuple[Y, PyTree[Array], Bool[Array, ""]]:
-        """One step of one path: its state and the arrays of the solver's state after the
-        step, and whether it succeeded."""
+        """Takes one step of one path. Returns its state and the arrays of the solver's
+        state after the step, and whether the step succeeded."""
         # Both times follow from the number of the step, so that `next_t` is exactly the `t`
         # of the next step.
         t = self.t0 + i * h
         next_t = self.t0 + (i + 1) * h
-        # Only arrays are carried from step to step. The rest of the solver's state is the
-        # same in all steps: it is taken from an initial state, of which no array is
-        # computed.
+        # Only the arrays of the solver's state are carried from step to step. The rest is
+        # the same in all steps: it is taken from an initial state of the solver, which
+        # `eqx.filter_eval_shape` makes without computing its arrays.
         initial_state = eqx.filter_eval_shape(
             self.solver.init, terms, t, next_t, y, self.args
         )
@@ -319,6 +334,8 @@ class Problem(eqx.Module):
         """Whether the solver is known to solve equations in a step."""
         solver = self.solver
         if isinstance(solver, AbstractSymplecticSolver):
+            # For a step with one noise, the numbers of unknowns in each of its systems of
+            # equations.
             return len(solver.stage_vectors(1)) > 0
         return isinstance(solver, diffrax.AbstractImplicitSolver)
 
@@ -347,9 +364,10 @@ class Problem(eqx.Module):
 def _with_examples(
     y0: Y | Callable, args: Args | Callable, key: PRNGKeyArray, caller: str
 ) -> tuple[Y, Callable | None, Args, Callable | None]:
-    """The fields `y0`, `y0_of`, `args` and `args_of` of a `Problem`, of which `y0_of` is
-    still the user's function itself. Examples may be drawn from any key, since all draws
-    have the same structure."""
+    """The fields `y0`, `y0_of`, `args` and `args_of` of a `Problem`, with examples drawn
+    from `key` where the user passes functions. Here `y0_of` is still the user's function
+    itself: `_as_programs` traces it. Any key will do, since all draws have the same
+    structure."""
     args_of = args if callable(args) else None
     if args_of is not None:
         args = drawn_args(args_of, key)
@@ -375,8 +393,8 @@ def _as_programs(
     args: Args,
     key: PRNGKeyArray,
 ) -> tuple:
-    """Returns `phi`, `terms`, `solver`, `y0_of` and `args`, with a program (see
-    `_programs`) in place of each function of the user.
+    """Returns `phi`, `terms`, `solver`, `y0_of` and `args`, with a program in place of each
+    function of the user: the function as traced by JAX (see `_programs`).
 
     In `args`, an array takes the place of each Python float, so that other numbers compile
     nothing anew. But if a function of the user needs the numbers themselves, for example in
@@ -386,8 +404,7 @@ def _as_programs(
     def programs_for(args: Args) -> tuple:
         draw_y0 = None
         if y0_of is not None:
-            draw = ft.partial(drawn_state, y0_of)
-            draw_y0 = traced(draw, key, args, identity=y0_of)
+            draw_y0 = traced(ft.partial(drawn_state, y0_of), key, args, identity=y0_of)
         return (
             traced_phi(phi, terms, t0, y0, args),
             with_programs(terms, t0, y0, args),
@@ -400,6 +417,9 @@ def _as_programs(
         # Integers are kept, since they may be exponents or sizes.
         return jnp.asarray(x) if type(x) is float else x
 
+    # A function that needs numbers themselves raises one of `NEED_VALUES`, of which
+    # `call_user_function` makes a `ValueError`. A `ValueError` with another cause is raised
+    # again in the second attempt.
     try:
         return programs_for(jtu.tree_map(float_as_array, args))
     except (ValueError, *NEED_VALUES):
@@ -421,7 +441,7 @@ def _struct_of_phi(
 
 
 def _order_of(solver: diffrax.AbstractSolver, terms: PyTree) -> int | float:
-    """The weak order of a solver for these terms. It counts as 1 for solvers of other
+    """The weak order of a solver for these terms. It is taken to be 1 for solvers of other
     packages, which have no `weak_order`, and for solvers of the user that return `None`."""
     return getattr(solver, "weak_order", lambda terms: 1)(terms) or 1
 
@@ -429,21 +449,22 @@ def _order_of(solver: diffrax.AbstractSolver, terms: PyTree) -> int | float:
 def advice_on_failures(problem: Problem | None) -> str:
     """Tells users, in sentences for a message, what to do about failed paths. `problem` is
     `None` for `monte_carlo`, which averages any function of the user."""
-    no_solution = ""
-    alternative = " or bounded increments, as from a `WeakBrownianPath`,"
+    on_equations = ""
+    or_bounded = " or bounded increments, as from a `WeakBrownianPath`,"
     if problem is not None:
         if problem.is_implicit:
-            no_solution = (
+            on_equations = (
                 "The equations of an implicit step may have no solution, for example where "
                 "particles meet: pass a smaller `dt0`, or an explicit solver. If they are "
                 "only hard, pass `root_finder=PicardNewton(newton_steps=1000)` to the "
                 "solver. "
             )
+        # There is nothing to gain if all increments are bounded already.
         if all(map(has_bounded_increments, brownian_paths(problem.terms))):
-            alternative = ""
+            or_bounded = ""
     return (
-        f"{no_solution}"
-        f"Take smaller steps{alternative} and look for NaNs in `y0`, `args` and the "
+        f"{on_equations}"
+        f"Take smaller steps{or_bounded} and look for NaNs in `y0`, `args` and the "
         "Hamiltonians, and for a `temperature` or `friction` that is negative or, as a "
         "matrix, not symmetric positive semidefinite."
     )

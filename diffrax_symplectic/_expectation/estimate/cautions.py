@@ -59,10 +59,10 @@ def _cautions_on_failures(estimate: Expectation, advice: str) -> Iterator[str]:
     if estimate.num_samples == 0:
         consequence = "there is no mean"
     else:
-        largest = largest_error(vectors.failed_error)
         consequence = (
             "they are left out of the mean, and could change it by more than its standard "
-            f"error, up to {largest:.1e}, which is part of `error`"
+            f"error, up to {largest_error(vectors.failed_error):.1e}, which is part of "
+            "`error`"
         )
     if estimate.levels > 1:
         num_with_dt0, num_with_half, *_ = estimate.failed_on
@@ -87,8 +87,7 @@ def _cautions_on_mean(estimate: Expectation) -> Iterator[str]:
             "Take smaller steps or a more stable solver, and check whether single paths "
             "stay bounded."
         )
-    best = combined_results(estimate, Combination.BEST)
-    if np.any(best.dropped):
+    if np.any(combined_results(estimate, Combination.BEST).dropped):
         yield (
             "A control variate was dropped: its mean over these paths is more than five "
             "standard errors from zero, or not finite. The estimate is crude Monte Carlo. "
@@ -105,12 +104,11 @@ def _cautions_on_tails(estimate: Expectation) -> Iterator[str]:
     # Zero where heavy tails do not matter.
     relevant_heaviness = np.nan_to_num(heaviness * matters)
     heaviest = int(np.argmax(relevant_heaviness))
-    r = relevant_heaviness[heaviest]
-    if r > _HEAVY:
-        # For replicates of many paths, `r` is that of the paths of one replicate.
+    if relevant_heaviness[heaviest] > _HEAVY:
+        # For replicates of many paths, the heaviness is that within one replicate.
         is_replicate = estimate.paths_per_sample > 1
         num_paths = estimate.paths_per_sample if is_replicate else estimate.num_samples
-        share = share_of_largest(r, num_paths)
+        share = share_of_largest(relevant_heaviness[heaviest], num_paths)
         yield (
             f"One path in {num_paths:,} accounts for {share:.0%} of the variance"
             f"{label_of(estimate, heaviest)}: still rarer paths may contribute much to the "
@@ -123,15 +121,15 @@ def _cautions_on_tails(estimate: Expectation) -> Iterator[str]:
 def _cautions_on_samples(estimate: Expectation) -> Iterator[str]:
     """Warns of samples that are all zero, or all equal."""
     moments = total(estimate.moments)
-    # The largest absolute values of `phi`. (With a control variate, a sample is not zero
-    # where `phi` is.)
+    # The largest absolute values of `phi` itself. (With a control variate, a sample is not
+    # zero where `phi` is.)
     largest_values = moments.size.without_control[Combination.BEST]
     arrays = jtu.tree_leaves(estimate.layout.unravel(largest_values))
     # The smallest number whose rounding errors do not underflow.
     precision = jnp.finfo(estimate.dtype)
     smallest = float(precision.tiny / precision.eps)
-    # Users are warned only if an array of `phi` is zero as a whole. A single entry may well
-    # be zero, such as a momentum at the start.
+    # Users are warned only if all entries of an array of `phi` are zero. A single entry may
+    # well be zero, such as a momentum at the start.
     if any(np.max(array) < smallest for array in arrays):
         yield (
             f"An output of `phi` is zero, or underflows {estimate.dtype}, on all paths. If "
@@ -150,32 +148,34 @@ def _cautions_on_samples(estimate: Expectation) -> Iterator[str]:
 
 
 def _cautions_on_steps(estimate: Expectation) -> Iterator[str]:
-    """Warns of two steps whose means differ much. (With three or more,
-    `Expectation.off_order` tells whether the steps are too long.)"""
+    """Warns of two steps that do not agree: the change of the mean by extrapolation exceeds
+    each of three bounds. (With three levels or more, `Expectation.off_order` tells whether
+    the steps are too long.)"""
     if estimate.levels != 2:
         return
     vectors = estimate.vectors
-    # The means with the smaller step.
-    finest = vectors.mean + vectors.bias
+    best = combined_results(estimate, Combination.BEST)
     change = combined_results(estimate, Combination.EXTRAPOLATION)
     size_of_change = np.abs(change.mean)
-    noise = _STD_ERRORS_TO_BE_SURE * change.std_error
-    # Rounding errors are in proportion to the largest absolute values of samples.
-    sizes = total(estimate.moments).size
-    size = np.fmax(sizes.value, sizes.without_control)[Combination.BEST]
-    rounding = ROUNDING * float(jnp.finfo(estimate.dtype).eps) * size
+    # The mean with the smaller step.
+    finest = vectors.mean + vectors.bias
     # The standard deviation of a path.
-    best = combined_results(estimate, Combination.BEST)
     deviation = best.plain_s
     num_paths = estimate.paths_per_sample
     if num_paths > 1:
         # A sample is a mean over many paths. The deviation of one path is at least this.
-        deviation = least_deviation(best.max_deviation, best.heaviness, num_paths)
-    is_real = size_of_change > np.maximum(noise, rounding)
-    is_large_for_mean = size_of_change > _LARGE_SHARE_OF_MEAN * np.abs(finest)
-    is_large_for_path = size_of_change > _LARGE_SHARE_OF_DEVIATION * deviation
-    disagrees = is_real & is_large_for_mean & is_large_for_path
-    # The mean may be zero.
+        deviation = least_deviation(best.max_deviation, r=best.heaviness, n=num_paths)
+    # Rounding errors are in proportion to the largest absolute values of samples.
+    sizes = total(estimate.moments).size
+    size = np.fmax(sizes.value, sizes.without_control)[Combination.BEST]
+    rounding = ROUNDING * float(jnp.finfo(estimate.dtype).eps) * size
+    bounds = [
+        _LARGE_SHARE_OF_MEAN * np.abs(finest),
+        _LARGE_SHARE_OF_DEVIATION * deviation,
+        np.maximum(_STD_ERRORS_TO_BE_SURE * change.std_error, rounding),
+    ]
+    disagrees = np.all(size_of_change > np.stack(bounds), axis=0)
+    # The mean may be zero, and the ratio infinite.
     with np.errstate(divide="ignore", invalid="ignore"):
         ratios = size_of_change / np.abs(finest)
     ratios_to_tell = np.nan_to_num(np.where(disagrees, ratios, 0))

@@ -32,9 +32,12 @@ _STD_ERRORS_BY_CHANCE = 2
 
 
 def heaviness(largest: Any, s: Any, n: Any, numpy: Any = np) -> Any:
-    """How heavy the tails of `n` values are: the `r` of `Expectation.std_error`. It is zero
-    for tails like those of a normal variable, and near one if a single value accounts for
-    all of the variance.
+    """How heavy the tails of `n` values are: the `r` of `Expectation.std_error`,
+
+        max(largest - s sqrt(4.5 log(n)), 0) / (s sqrt(n)).
+
+    It is zero for tails like those of a normal variable, and near one if a single value
+    accounts for all of the variance.
 
     - `largest`: the largest deviation of a value from the mean.
     - `s`: the standard deviation. If it is zero, the result is not finite.
@@ -46,9 +49,9 @@ def heaviness(largest: Any, s: Any, n: Any, numpy: Any = np) -> Any:
 
 def share_of_largest(r: Any, n: int) -> Any:
     """The share of the value that deviates most in the sum of squared deviations of `n`
-    values, from their `heaviness` `r`, which must be positive. (For `r = 0` the largest
-    deviation is not known.)"""
-    # The formula of `heaviness`, solved for `largest`, squared and divided by `n s^2`.
+    values, `largest^2 / (n s^2)`, from their `heaviness` `r`, which must be positive. (For
+    `r = 0` the largest deviation is not known.)"""
+    # By the formula of `heaviness`, `largest = s (r sqrt(n) + sqrt(4.5 log(n)))`.
     return np.minimum((r + np.sqrt(_SQUARE_PER_LOG * np.log(max(n, 2)) / n)) ** 2, 1)
 
 
@@ -56,7 +59,7 @@ def least_deviation(largest: Any, r: Any, n: int) -> Any:
     """The standard deviation of `n` values, from their largest deviation and their
     `heaviness` `r`. Where `r` is zero, the result is a lower bound of the standard
     deviation."""
-    # The formula of `heaviness`, solved for `s`.
+    # By the formula of `heaviness`, `largest = s (r sqrt(n) + sqrt(4.5 log(n)))`.
     return largest / (r * np.sqrt(n) + np.sqrt(_SQUARE_PER_LOG * np.log(max(n, 2))))
 
 
@@ -92,7 +95,12 @@ class Results(NamedTuple):
 @np.errstate(all="ignore")
 def results_of(moments: Moments, dtype: str, rounding_floor: int) -> Results:
     """The results for all combinations of levels, from the moments of all samples. `dtype`
-    and `rounding_floor` are fields of `Expectation`."""
+    and `rounding_floor` are fields of `Expectation`.
+
+    With a control variate, results are computed from values less the control variate, and
+    again from plain values, without it. Plain values count where the control variate is
+    dropped, because its mean is not zero as it should be, or is not finite.
+    """
     n = moments.num_good
     mean = moments.mean
     norm = moments.norm
@@ -116,17 +124,18 @@ def results_of(moments: Moments, dtype: str, rounding_floor: int) -> Results:
         # A control variate is kept for all combinations of levels or for none.
         is_kept_for_all = np.all(is_kept & np.isfinite(mean.value), axis=0)
         dropped = np.broadcast_to(~is_kept_for_all, plain_mean.shape)
-    best_mean = np.where(dropped, plain_mean, mean.value)
+    used_mean = np.where(dropped, plain_mean, mean.value)
+    used = _Spread(*[np.where(dropped, *pair) for pair in zip(of_plain, of_value)])
     # Replicates average the largest deviations of their paths. Otherwise a sample is a
     # single path.
     max_deviation = largest.without_control if mean.largest is None else mean.largest
     return Results(
-        mean=best_mean if n > 0 else np.full_like(plain_mean, np.nan),
-        std_error=np.where(dropped, of_plain.std_error, of_value.std_error),
+        mean=used_mean if n > 0 else np.full_like(plain_mean, np.nan),
+        std_error=used.std_error,
         plain_std_error=of_plain.std_error,
         plain_s=of_plain.s,
-        variance=np.where(dropped, of_plain.s, of_value.s) ** 2,
-        heaviness=np.where(dropped, of_plain.r, of_value.r),
+        variance=used.s**2,
+        heaviness=used.r,
         dropped=dropped,
         max_deviation=max_deviation,
     )
@@ -152,9 +161,10 @@ def _spread_of(
     largest: np.ndarray,
     r_of_paths: np.ndarray | None = None,
 ) -> _Spread:
-    """The spread of `n` values, by the formula of `Expectation.std_error`.
+    """The spread of `n` values. The standard error of their mean is that of
+    `Expectation.std_error`, `sqrt(s^2 / n (1 + 4 r^2 / (1 - r^2)^4))`.
 
-    - `rounding`: the rounding error of the mean, the least standard error.
+    - `rounding`: the rounding error of the mean. The standard error is at least this.
     - `norm`, `largest`: as in `Moments`.
     - `r_of_paths`: if each value is a mean over many paths, the `heaviness` of the paths,
         since the mean hides their tails.
@@ -162,7 +172,7 @@ def _spread_of(
     s = norm / np.sqrt(n - 1) if n > 1 else np.full_like(norm, np.nan)
     # Rounding errors can have heavy tails, which do not count.
     is_random = (s > 0) & (largest > ROUNDING * rounding)
-    r_of_values = np.where(is_random, heaviness(largest, s, n), 0)
+    r_of_values = np.where(is_random, heaviness(largest, s=s, n=n), 0)
     larger_r = r_of_values if r_of_paths is None else np.fmax(r_of_values, r_of_paths)
     r = np.minimum(larger_r, _LARGEST_HEAVINESS)
     std_error = s / np.sqrt(n) * np.sqrt(1 + 4 * r**2 / (1 - r**2) ** 4)
@@ -173,8 +183,10 @@ def _spread_of(
 def discretization_error(
     results: Results, levels: int
 ) -> tuple[np.ndarray, np.ndarray | None]:
-    """The properties `discretization_error` and `off_order` of an `Expectation` with two
-    levels or more, as vectors of all numbers of `phi`."""
+    """What remains of the discretization error in each mean, and whether the changes by
+    smaller steps do not fit the order of the solver (`None` for two levels): the properties
+    `discretization_error` and `off_order` of an `Expectation`, as vectors. There are two
+    levels or more."""
     changes = np.abs(results.mean)
     error = changes[Combination.EXTRAPOLATION]
     if levels == 2:

@@ -225,6 +225,7 @@ class Expectation(eqx.Module):
                 )
             check_same(self, other, "An estimate to merge")
         parts = [part for estimate in (self, *others) for part in estimate.moments]
+        # In the order of samples, two parts with samples in common are neighbours.
         parts.sort(key=lambda part: part.begin)
         for before, after in zip(parts, parts[1:]):
             if after.begin < before.end:
@@ -278,19 +279,17 @@ class Expectation(eqx.Module):
                 "is taken for the error (take smaller steps)"
             )
         plural = "" if self.levels == 1 else "s"
+        sampling = self.sampling
         # With `tol` the number of paths in the sampling is an upper limit, which does not
         # say how many were taken.
-        sampling = self.sampling
         if self.tol_reached is not None:
             sampling = f"{type(self.sampling).__name__} until `tol`"
         lines.append(
             f"{self.num_paths:,} paths on {self.levels} level{plural}, "
             f"{self.num_failed:,} failed, {sampling}"
         )
-        if self.reason:
-            lines.append(self.reason)
-        if self.caveat:
-            lines.append(self.caveat)
+        # Either may be empty.
+        lines += filter(None, [self.reason, self.caveat])
         if self.tol_reached is False:
             lines.append("`tol` was not reached")
         return "\n".join(lines)
@@ -341,10 +340,10 @@ class Expectation(eqx.Module):
         if self.num_samples == 0:
             return np.nan
         num_drawn = sum(part.end - part.begin for part in self.moments)
-        # A sample of one path is not good if the path fails. A replicate of many paths
-        # leaves out its failed paths, which count as a fraction of a sample.
-        num_failed = self.num_failed / self.paths_per_sample
-        return max(num_drawn - self.num_samples, num_failed) / num_drawn
+        # Samples that are not good have failed as a whole. In a good sample of many paths
+        # some may have failed: each counts as a fraction of a sample.
+        num_not_good = num_drawn - self.num_samples
+        return max(num_not_good, self.num_failed / self.paths_per_sample) / num_drawn
 
     def _tree(self, x: np.ndarray | None) -> Any:
         """The numbers of a vector in the structure of `phi`; `None` for `None`."""
@@ -401,9 +400,9 @@ def combined_results(estimate: Expectation, combination: Combination) -> Results
 
 
 def check_same(one: Expectation, other: Expectation, name: str) -> None:
-    """Raises a `ValueError` unless two estimates may be parts of one: with the same
-    arguments, key, shapes, levels, and number of paths in a sample. `name` is what messages
-    call one of the two, such as "`start`"."""
+    """Raises a `ValueError` unless two estimates may be parts of one estimate: they must
+    have the same arguments, key, shapes, levels, and number of paths in a sample. `name` is
+    what messages call one of the two, such as "`start`"."""
     # Estimates from some files have no digests. Only arguments that both have are compared.
     digests = one.digests or {}
     other_digests = other.digests or {}
@@ -445,14 +444,15 @@ def label_of(estimate: Expectation, place: int) -> str:
 
 
 def _rounded(mean: float, error: float) -> str:
-    """The mean, rounded to two digits of its error: `0.364083` for an error of 8.6e-05,
-    `4.372e-44` for one of 1.2e-46."""
+    """The mean, rounded to two digits of its error: `0.364083` for an error of 8.6e-05, and
+    in scientific notation, `4.372e-44`, for an error of 1.2e-46."""
     if not (np.isfinite(mean) and 0 < error < np.inf):
         return f"{mean:.6g}"
     exponent = _exponent(max(abs(mean), error))
-    # The exponent of the last digit. Beyond the fifteenth digit, float64 has none.
+    # The power of ten of the last digit: of the second digit of the error, unless float64
+    # has no such digit of the mean.
     last_exponent = max(_exponent(error) - 1, exponent - 15)
-    # The sum makes a negative zero positive.
+    # Adding zero makes a negative zero positive.
     rounded = round(mean, -last_exponent) + 0.0
     if -5 < exponent < 7:
         return f"{rounded:.{max(-last_exponent, 0)}f}"
@@ -462,7 +462,7 @@ def _rounded(mean: float, error: float) -> str:
 
 
 def _exponent(size: float) -> int:
-    """The exponent of a positive number in scientific notation."""
+    """The power of ten of the first digit of a positive number."""
     return math.floor(math.log10(size))
 
 

@@ -75,12 +75,15 @@ def _are_halves(a: Moments, b: Moments) -> bool:
 
 @np.errstate(over="ignore", invalid="ignore", under="ignore")
 def _moments_of_both(a: Moments, b: Moments) -> Moments:
-    """The moments of all samples of `a` and `b`, by the pairwise formula of
-    [Chan, Golub and LeVeque (1983)](https://doi.org/10.1080/00031305.1983.10483115)."""
+    """The moments of all samples of `a` and `b`, by the pairwise formulas of
+    [Chan, Golub and LeVeque (1983)](https://doi.org/10.1080/00031305.1983.10483115). With
+    n = n_a + n_b good samples,
+
+        mean   = mean_a + (n_b / n) (mean_b - mean_a),
+        norm^2 = norm_a^2 + norm_b^2 + (n_a n_b / n) (mean_b - mean_a)^2."""
     n = max(a.num_good + b.num_good, 1)
     share_of_b = b.num_good / n
-    # The sum of squared deviations of all samples is that of `a`, plus that of `b`, plus
-    # `weight**2` times the squared difference of their means.
+    # The root of n_a n_b / n.
     weight = np.sqrt(a.num_good / n * b.num_good)
     differences = jtu.tree_map(np.subtract, b.mean, a.mean)
 

@@ -79,10 +79,16 @@ def read(file: BinaryIO) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
 
 def contents_of(estimate: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """The header and the arrays of a file, from an `Expectation` (whose module imports this
-    one). Raises a `ValueError` for PyTree nodes in `phi` that JSON cannot express."""
+    one). Raises a `ValueError` for PyTree nodes in `phi` that JSON cannot express.
+
+    The estimate holds the `Moments` of its samples in several parts. Their counts go to the
+    header, as `ranges`. Their statistics go to the arrays `mean`, `norm`, `largest` and
+    `size`, whose axes are parts, fields of `Averaged` (named in the header as `averaged`),
+    combinations of levels, and numbers of `phi`."""
     layout = estimate.layout
     sampling = estimate.sampling
-    # Functions in a sampling, such as `sort_by`, are left out.
+    # Only fields that are numbers, words or `None` are saved: functions in a sampling, such
+    # as `sort_by`, are left out.
     fields_of_sampling = {}
     for name, x in ({} if sampling is None else vars(sampling)).items():
         if isinstance(x, np.integer):
@@ -90,7 +96,7 @@ def contents_of(estimate: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         elif x is None or isinstance(x, int | float | str):
             fields_of_sampling[name] = x
     structs = [jax.ShapeDtypeStruct(shape, float) for shape in layout.shapes]
-    # All parts have the same fields of `Averaged`.
+    # All parts have the same fields of `Averaged`, so the first part tells their names.
     first, *_ = estimate.moments
     # The names here are part of the format of files, so they must not be changed.
     header = {
@@ -107,9 +113,8 @@ def contents_of(estimate: Any) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     header |= {name: getattr(estimate, name) for name in _FIELDS_OF_ESTIMATE}
     arrays = {}
     for name in _AVERAGED:
-        of_parts = [getattr(part, name).fields.values() for part in estimate.moments]
-        # (parts, fields of `Averaged`, combinations of levels, numbers)
-        arrays[name] = np.array([[*arrays_of_part] for arrays_of_part in of_parts])
+        parts = [[*getattr(part, name).fields.values()] for part in estimate.moments]
+        arrays[name] = np.array(parts)
     arrays["key_data"] = estimate.key_data
     if estimate.ts is not None:
         arrays["ts"] = estimate.ts
@@ -124,7 +129,8 @@ def fields_from(
     any error."""
     layout = Layout.of(_tree_of(header["structure"]), header["num_times"])
     whole_number("rounding_floor", header["rounding_floor"])
-    _check(bool(jnp.finfo(header["dtype"])))
+    # Raises an error unless this is a dtype of floating-point numbers.
+    jnp.finfo(header["dtype"])
     _check(arrays["key_data"].dtype == np.uint32)
     moments = _moments_from(header, arrays, layout)
     if header["digests"] is None:
@@ -147,35 +153,38 @@ def fields_from(
 def _moments_from(
     header: dict[str, Any], arrays: dict[str, np.ndarray], layout: Layout
 ) -> tuple[Moments, ...]:
-    """The moments of an estimate. Raises a `ValueError` for counts and shapes that no
+    """The moments of an estimate, from the counts in `ranges` of the header and the arrays
+    of statistics (see `contents_of`). Raises a `ValueError` for counts and shapes that no
     estimate has."""
     levels = whole_number("levels", header["levels"])
     paths_per_sample = whole_number("paths_per_sample", header["paths_per_sample"])
     names = header["averaged"]
-    # More levels than three have no further combinations.
+    # With more levels than three there are no more combinations of levels.
     num_combinations = len(level_weights(1, min(levels, 3)))
-    shape = len(header["ranges"]), len(names), num_combinations, layout.size
+    # Each array of statistics has this shape, and there is at least one part.
+    shape = (len(header["ranges"]), len(names), num_combinations, layout.size)
     _check(len(header["ranges"]) > 0)
     for name in _AVERAGED:
         _check(arrays[name].shape == shape and arrays[name].dtype == np.float64)
     moments = []
-    # Parts are in the order of their samples, and do not overlap.
+    # Parts are in the order of their samples, and do not overlap. So the samples of a part
+    # begin at the end of the part before, or later.
     end_before = 0
     for k, (begin, end, num_good, num_failed, failed_on) in enumerate(header["ranges"]):
-        whole_number("begin", begin, end_before)
-        whole_number("end", end, begin + 1, MOST_SAMPLES)
-        whole_number("num_good", num_good, 0, end - begin)
+        whole_number("begin", begin, least=end_before)
+        whole_number("end", end, least=begin + 1, most=MOST_SAMPLES)
+        whole_number("num_good", num_good, least=0, most=end - begin)
         num_paths = (end - begin) * paths_per_sample
-        whole_number("num_failed", num_failed, 0, num_paths)
+        whole_number("num_failed", num_failed, least=0, most=num_paths)
         _check(len(failed_on) == levels)
         for number in failed_on:
-            whole_number("failed_on", number, 0, num_failed)
+            whole_number("failed_on", number, least=0, most=num_failed)
         averaged = {
             name: Averaged(**dict(zip(names, arrays[name][k]))) for name in _AVERAGED
         }
         # JSON has made a list of the tuple `failed_on`.
-        counts = begin, end, num_good, num_failed, tuple(failed_on)
-        moments.append(Moments(*counts, **averaged))
+        part = Moments(begin, end, num_good, num_failed, tuple(failed_on), **averaged)
+        moments.append(part)
         end_before = end
     return tuple(moments)
 

@@ -28,7 +28,11 @@ def is_reached(estimate: Expectation, tol: float) -> bool:
 
 def is_stuck(estimate: Expectation, tol: float) -> bool:
     """Whether more samples would not reach the tolerance, because too much of the error
-    comes from the steps or from failed paths."""
+    comes from the steps or from failed paths. This is so in three cases:
+
+    - The changes of the means by smaller steps do not fit the order of the solver.
+    - What remains of a discretization error alone is surely above the tolerance.
+    - The standard errors are far below the tolerance, and a whole error is not."""
     vectors = estimate.vectors
     if vectors.is_off_order:
         return True
@@ -74,7 +78,10 @@ def share_of_needed(estimate: Expectation, tol: float | None) -> float:
 
 def shortfall(estimate: Expectation, tol: float) -> str:
     """Says which part of the error keeps the whole error above `tol`, and what to do about
-    it. The result is the rest of a sentence of a message, and sometimes one more sentence,
+    it. This is the largest part: failed paths, the discretization or the sampling. If the
+    changes by smaller steps do not fit the order of the solver, the error is not known.
+
+    The result is the rest of a sentence of a message, and sometimes one more sentence,
     without the full stop at the end."""
     vectors = estimate.vectors
     if vectors.is_off_order:
@@ -96,11 +103,14 @@ def shortfall(estimate: Expectation, tol: float) -> str:
             f"{estimate.levels} levels. Pass a smaller `dt0`, or more `levels`"
         )
     rest = np.hypot(discretization, failed_error)
-    # The rest of the error leaves `sqrt(tol**2 - rest**2)` for sampling. The difference is
-    # computed as a product, since the square of a small tolerance would underflow.
+    # The rest of the error leaves `sqrt(tol**2 - rest**2)` for sampling, or nothing. It is
+    # computed as `sqrt(tol - rest) * sqrt(tol + rest)`, since the square of a small
+    # tolerance would underflow.
     left_for_sampling = np.sqrt(max(tol - rest, 0.0)) * np.sqrt(tol + rest)
+    # With nothing left, the number of paths would be infinite.
     allowed = max(left_for_sampling, tol / 10)
     ratio = sampling_error / float(allowed)
+    # The sampling error decreases like one over the square root of the number of paths.
     needed_paths = estimate.num_paths * ratio * ratio
     return (
         f"the sampling error is {sampling_error:.1e} after {estimate.num_paths:,} paths. "
