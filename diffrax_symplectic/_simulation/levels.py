@@ -134,7 +134,7 @@ def level_weights(
         # An extrapolation from `levels - 2` levels eliminates `levels - 3` powers of the
         # step size from the error. Halving the step divides what remains by 2^power, with
         # the first power that is left.
-        power = order + levels - 3
+        *_, power = _powers_in_error(order, levels - 2)
         miss = last_change - 2.0**-power * change_before
         rows += [last_change, change_before, miss]
     return np.stack(rows)
@@ -161,13 +161,16 @@ def _extrapolation_weights(
     # weights solve, with a sum over the levels k,
     #
     #     sum_k 2^(-power k) weight_k = 1 for power 0, and 0 for the powers in the error.
-    #
-    # The powers in the error begin with the order and increase by 1, or for order 1/2 by
-    # 1/2.
-    powers = np.append(0.0, order + min(order, 1) * np.arange(levels - 1))
+    powers = np.append(0.0, _powers_in_error(order, levels - 1))
     matrix = 2.0 ** -np.outer(powers, np.arange(levels))
     right_side = np.append(1.0, np.zeros(levels - 1))
     return np.linalg.solve(matrix, right_side)
+
+
+def _powers_in_error(order: int | float, count: int) -> Float[np.ndarray, " count"]:
+    """The first powers of the step size in the error: they begin with the order, and rise
+    by 1, or for order 1/2 by 1/2."""
+    return order + min(order, 1) * np.arange(count)
 
 
 def combinations(

@@ -388,21 +388,24 @@ def test_paths_that_fail_with_longer_steps_alone_are_told():
 
 
 @pytest.mark.parametrize(
-    "order, levels", [(1, 1), (2, 2), (3, 2), (1, 3), (2, 3), (1, 4), (2, 4)]
+    "order, levels",
+    [(1, 1), (2, 2), (3, 2), (1, 3), (2, 3), (1, 4), (2, 4), (0.5, 3), (0.5, 4)],
 )
 def test_weights_of_levels_cancel_powers_of_the_step_size(order, levels):
     weights = level_weights(order, levels)
     h = 0.5 ** np.arange(levels)
     best = weights[Combination.BEST]
     np.testing.assert_allclose(best.sum(), 1)
-    for power in range(order, order + levels - 1):
+    # For order 1/2 the error has powers of the root of the step size.
+    powers = [order + min(order, 1) * k for k in range(levels - 1)]
+    for power in powers:
         assert abs(best @ h**power) < 1e-13
     if levels == 1:
         return
     # The finest level is the best estimate and its bias. What the last power but one
     # leaves is what the last extrapolation takes away.
     np.testing.assert_allclose(best + weights[1], np.eye(levels)[-1], atol=1e-13)
-    last_power = order + levels - 2
+    last_power = powers[-1]
     extrapolation = weights[Combination.EXTRAPOLATION]
     np.testing.assert_allclose(extrapolation.sum(), 0, atol=1e-13)
     before = best - extrapolation
@@ -416,7 +419,7 @@ def test_weights_of_levels_cancel_powers_of_the_step_size(order, levels):
     # Changes are compared after all but one power is eliminated. Lower powers come with a
     # sign that would turn the changes of the means.
     last, before, miss = weights[Combination.LAST :]
-    power = last_power - 1
+    power = powers[-2]
     means = 1 + h**power - 0.6 * (power > order) * h**order
     assert last @ means == pytest.approx(2.0**-power * (before @ means), rel=1e-12)
     assert abs(before @ means) > 1e-3 and abs(miss @ means) < 1e-14

@@ -158,7 +158,8 @@ class Expectation(eqx.Module):
         changes is taken instead, and the printed estimate says so.
 
         With $L > 3$ levels the same holds for the extrapolations from $L - 2$ neighbouring
-        levels, of order $p + L - 3$, in place of the means on single levels.
+        levels, of order $p + L - 3$, in place of the means on single levels. (For order 1/2
+        the powers of the step size rise by 1/2: here it is of order $(L - 2) / 2$.)
 
         With three levels or more, the order $p + L - 2$ of the last extrapolation is not
         checked. So its change is taken for at least as large as if the extrapolation were
