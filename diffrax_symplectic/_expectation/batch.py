@@ -62,28 +62,35 @@ def _moments_on_devices(
     mesh: Mesh,
     samples_per_device: int,
 ) -> BatchMoments:
-    """The moments on all devices, along a leading axis. `low_high` are the low and the high
-    32 bits of the number of the batch's first sample. Only the first `num_wanted` samples
-    of all devices together count."""
+    """The moments of a batch on all devices, along a leading axis. Each device takes
+    `samples_per_device` samples, each with a key that is made of the number of the sample.
+
+    - `sampler`: maps keys to samples.
+    - `key_data`, `key_impl`: the data and the implementation of the user's key.
+    - `low_high`: the low and the high 32 bits of the number of the batch's first sample.
+        (JAX may have no 64-bit integers.)
+    - `num_wanted`: only so many samples count, the first of all devices together. (All
+        batches have the same size, since another size would compile anew. The last one may
+        have more samples than are wanted.)"""
 
     def moments_on_device(sampler, low_high, num_wanted, device):
         # The indices of this device's samples within the batch.
         index = device * samples_per_device + jnp.arange(samples_per_device)
-        # The low and the high bits of the sample numbers. (JAX may have no 64-bit
-        # integers.)
+        # The sum of the number of the first sample and the index, by halves of 32 bits.
         low = low_high[0] + index.astype(jnp.uint32)
-        # The sum has wrapped around if it is less than one of its terms.
+        # The lower half has wrapped around if it is less than one of its terms.
         has_carry = low < low_high[0]
         high = low_high[1] + has_carry.astype(jnp.uint32)
         key = jr.wrap_key_data(jnp.asarray(key_data), impl=key_impl)
         keys = jax.vmap(ft.partial(sample_key, key))(high, low)
-        # All batches have the same size, since another size would compile anew. In the last
-        # batch, some samples may not be wanted.
         return _moments_of(lapack_in_turn(sampler)(keys), index < num_wanted)
 
     if mesh.size == 1:
         moments = moments_on_device(sampler, low_high, num_wanted, device=0)
         return jtu.tree_map(lambda x: x[None], moments)
+
+    # Several devices run the same program, each on its own samples. `shard_map` takes
+    # arrays alone, so the rest of the sampler is captured.
     dynamic, static = eqx.partition(sampler, eqx.is_array)
 
     # Devices do not communicate until the end, so the moments on each do not depend on the
@@ -119,27 +126,35 @@ quick_batch_moments = compiled(_moments_on_devices, quickly=True)
 
 
 def _moments_of(samples: Samples, is_wanted: Bool[Array, " n"]) -> BatchMoments:
-    """The moments of the samples of one device that are wanted."""
+    """The moments of the samples of one device, as far as they are wanted."""
     good = samples.good & is_wanted
     # (levels, samples)
     failures = jnp.where(is_wanted, samples.num_failed, 0)
+    # A path that fails on several levels counts once.
     num_failed = jnp.sum(jnp.max(failures, axis=0))
     any_failed = num_failed > 0
     if samples.also_failed is not None:
         any_failed |= jnp.any(samples.also_failed & is_wanted)
     fields = samples.averaged.fields
     # The fields of `samples.averaged` are one array, since fewer operations compile sooner.
-    moments_of_fields = _moments_of_fields(jnp.stack([*fields.values()]), good)
-    averaged = [Averaged(**dict(zip(fields, x))) for x in moments_of_fields]
+    # Each statistic of this array is taken apart again into these fields.
+    statistics = _statistics(jnp.stack([*fields.values()]), good)
+    averaged = [Averaged(**dict(zip(fields, x))) for x in statistics]
     failed_on = jnp.sum(failures, axis=1)
     return BatchMoments(jnp.sum(good), num_failed, failed_on, any_failed, *averaged)
 
 
-def _moments_of_fields(
+def _statistics(
     x: Float[Array, "fields combinations n numbers"], good: Bool[Array, " n"]
 ) -> tuple[Float[Array, "fields combinations numbers"], ...]:
-    """The moments of the good samples that `BatchMoments` holds as an `Averaged`, in their
-    order there. `x` holds all fields of the `Averaged` of `n` samples."""
+    """The `mean`, `mean_correction`, `norm`, `largest` and `size` of `BatchMoments`, over
+    those of `n` samples that are good.
+
+    There are two passes over the samples: one for the mean, and one for the deviations from
+    it, as a difference of squares would cancel. The correction `c` is the mean of the
+    deviations `d`, which without rounding would be zero. About the corrected mean the sum
+    of squares is `sum(d**2) - n c**2`. Sums are taken of numbers that are scaled to a size
+    of about one."""
     is_used = good[:, None]
     # Without samples, sums are zero, and so are means with this divisor.
     divisor = jnp.maximum(jnp.sum(good), 1)
@@ -147,14 +162,12 @@ def _moments_of_fields(
     size = jnp.max(jnp.abs(x), axis=2)
     to_unit, to_size = _scales(size)
     mean = to_size * (jnp.sum(x * to_unit[:, :, None], axis=2) / divisor)
-    # Deviations from the mean, in a second pass, avoid the cancellation of a difference of
-    # squares. Without rounding, their own mean would be zero: it corrects the mean.
+
     deviations = jnp.where(is_used, x - mean[:, :, None], 0)
     largest = jnp.max(jnp.abs(deviations), axis=2)
     deviations_to_unit, to_deviations = _scales(largest)
     scaled = deviations * deviations_to_unit[:, :, None]
     scaled_correction = jnp.sum(scaled, axis=2) / divisor
-    # The sum of squared deviations from the corrected mean.
     scaled_squares = jnp.sum(scaled**2, axis=2) - divisor * scaled_correction**2
     mean_correction = to_deviations * scaled_correction
     norm = to_deviations * jnp.sqrt(jnp.maximum(scaled_squares, 0))
@@ -163,8 +176,8 @@ def _moments_of_fields(
 
 def _scales(size: Array) -> tuple[Array, Array]:
     """A power of two by which numbers of this size become about one, so that sums of them
-    and of their squares stay in range; and its inverse, to scale back. (XLA would divide by
-    the power as a product with its inverse, which may underflow.)"""
+    and of their squares stay in range; and the inverse of this power, to scale back. (XLA
+    would divide by the power as a product with its inverse, which may underflow.)"""
     largest_exponent = jnp.finfo(size.dtype).maxexp - _SPARE_EXPONENTS
     _, exponent = jnp.frexp(size)
     exponent = jnp.clip(exponent, -largest_exponent, largest_exponent)

@@ -23,10 +23,12 @@ def checked_call(
     devices: Sequence[Any] | None = None,
     other_arguments: Any = (),
 ) -> tuple[PRNGKeyArray, int, Devices]:
-    """Checks arguments, and returns the key as a typed key, the number of the first sample,
-    and the devices, which are all there are for `None`. Raises a `ValueError` for invalid
-    arguments, and for traced arrays in `key` and in `other_arguments`. `function_name` is
-    what messages call the function of the user's call."""
+    """Checks the arguments of a call of `function_name`. Raises a `ValueError` for an
+    invalid argument, and for traced arrays in `key` and in `other_arguments`. Returns
+
+    - the key as a typed key;
+    - the number of the first sample;
+    - the devices: for `None`, all that there are."""
     key = checked_key(function_name, key, other_arguments)
     if start is not None and first != 0:
         raise ValueError(
@@ -34,7 +36,8 @@ def checked_call(
         )
     first = whole_number("first", first, 0, MOST_SAMPLES - 1)
     is_number = is_real_number(tol) and np.ndim(tol) == 0
-    # Numbers below `tiny` have fewer digits.
+    # Positive numbers below `tiny` have fewer digits, and some processors take them for
+    # zero.
     if tol is not None and not (is_number and np.finfo(float).tiny <= tol < np.inf):
         raise ValueError(f"`tol` must be a positive number, or `None`; got {tol!r}.")
     if start is not None and not isinstance(start, Expectation):

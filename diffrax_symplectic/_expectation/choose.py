@@ -56,7 +56,8 @@ _FEWEST_PATHS_OF_REPLICATE = 2**7
 _REPLICATES_OF_TRIAL = 8
 _PATHS_OF_SORTED_TRIAL = 2**12
 _PATHS_OF_TRIAL = 2**14
-# Sorted paths take at most this many random words per step: to scramble more takes long.
+# Sorted paths take at most this many words per step, integers of 32 random bits of which
+# increments are made: to scramble more takes long.
 _MOST_WORDS = 2**8
 
 
@@ -72,13 +73,19 @@ def choose(
 ) -> tuple[Problem, AbstractSampling, SamplingPlan]:
     """Chooses the law of the increments and the sampling, unless the user did.
     `docs/expectation.md` states the rules. Returns the problem, its sampling and its plan,
-    which holds the reason for the choice.
+    which holds the reason for the choice. The sampling is the first of these:
+
+    1. `sampling`, if the user passed one, or else that of `start`;
+    2. the sampling that suits the problem, by `sampling_for`;
+    3. in place of value functions, sorted paths, if they are possible and a trial shows
+       that the fits of the value functions leave too much of the standard error.
+
+    Of the arguments, these are not arguments of `expectation`:
 
     - `problem_for`: makes the problem for a purpose, "weak" or "strong". For each path that
-        the user left open, the solver makes one that suits the purpose.
-    - `has_path`: whether the user's `terms` hold paths rather than their shapes.
-
-    The others are the arguments of `expectation`."""
+        the user left open, the solver makes one that suits the purpose, usually with
+        discrete increments for "weak" and Gaussian ones for "strong".
+    - `has_path`: whether the user's `terms` hold paths rather than their shapes."""
     if engine not in (None, "jax", "drjit"):
         raise ValueError(f'`engine` must be "jax", "drjit" or `None`; got {engine!r}.')
     if sampling is None and start is not None:
@@ -86,13 +93,15 @@ def choose(
 
     problem = problem_for("weak")
     why_law = ""
-    # Value functions need discrete increments, as do solvers of the weak sense.
+    # Value functions need discrete increments, and so do some solvers.
     needs_discrete = isinstance(sampling, ValueFunctions)
     needs_discrete |= has_discrete_increments(problem.solver)
     if has_kinks(problem) and not has_path and not needs_discrete:
         problem = problem_for("strong")
         why_law = "Gaussian increments, since phi may not be smooth"
 
+    # Only `choose` itself calls this function: warnings in `prepare` count the calls
+    # between them and the user.
     def plan_for(sampling: AbstractSampling) -> SamplingPlan:
         if engine == "drjit":
             return fused_plan(problem, key, sampling, devices)
@@ -105,7 +114,8 @@ def choose(
     else:
         sampling, why_sampling = sampling_for(problem, tol, engine)
         plan = plan_for(sampling)
-        # The remainder is zero except for value functions.
+        # The fraction of the standard error that the fits of value functions leave; zero
+        # for other samplings.
         if plan.remainder > _MOST_REMAINDER:
             sorted_paths = array_rqmc_for(problem, tol)
             if sorted_paths is not None:
@@ -115,9 +125,10 @@ def choose(
                 )
                 sampling = sorted_paths
                 plan = plan_for(sampling)
+        # The user did not choose this plan, so it is changed to take less time.
         if isinstance(sampling, ValueFunctions):
-            # A path with a control variate takes far longer than another, so none is taken
-            # in vain.
+            # A path with a control variate takes far longer than another. So sampling ends
+            # early where the error of the steps is far larger than that of sampling.
             least = int(plan.num_samples * _FRACTION_BESIDE_STEPS)
             plan = plan._replace(least_beside_steps=least)
         if isinstance(sampling, ArrayRQMC) and tol is None:
@@ -137,8 +148,8 @@ def choose(
 
 
 def _check_sampling(sampling: AbstractSampling, start: Expectation | None) -> None:
-    """Raises a `ValueError` unless `sampling` is a sampling, of the class of that of
-    `start`."""
+    """Raises a `ValueError` unless `sampling` is a sampling, and of the same class as that
+    of `start`, if there is a `start`."""
     if not isinstance(sampling, AbstractSampling):
         names = ", ".join(f"`{name}`" for name in SAVED_SAMPLINGS)
         raise ValueError(
@@ -160,10 +171,13 @@ def trial_key(key: PRNGKeyArray) -> PRNGKeyArray:
 def sampling_for(
     problem: Problem, tol: float | None, engine: str | None = None
 ) -> tuple[AbstractSampling, str]:
-    """The sampling that suits a problem best, and the reason for this choice."""
+    """The sampling that suits a problem best, and the reason for this choice: value
+    functions, or else sorted paths, or else independent paths, which suit every problem."""
     # This engine takes independent paths only, so there is nothing to choose.
     if engine == "drjit":
         return _independent_paths_for(problem, tol), ""
+    # How many values the random variables of a step may take together; `None` for many, or
+    # for increments that are not discrete.
     num_outcomes = count_outcomes(problem)
     size = f"{problem.num_components} components of the state, "
     size += f"{_num_steps(problem):,} steps"
@@ -202,16 +216,16 @@ def array_rqmc_for(problem: Problem, tol: float | None) -> ArrayRQMC | None:
     # In each step, for one path.
     operations = operations_per_step(problem) + _OPERATIONS_OF_SORTING
     # The number of paths in all replicates together.
-    num_affordable = np.clip(
-        int(_affordable_operations(problem) / operations),
-        default.replicates * _FEWEST_PATHS_OF_REPLICATE,
-        default.replicates * default.num_paths,
-    )
-    # Sobol' points need a power of two: the largest that allows as many replicates as by
-    # default. The paths that are left over are spent on further replicates.
-    most_of_replicate = int(num_affordable) // default.replicates
+    num_affordable = int(_affordable_operations(problem) / operations)
+    fewest = default.replicates * _FEWEST_PATHS_OF_REPLICATE
+    most = default.replicates * default.num_paths
+    num_affordable = int(np.clip(num_affordable, fewest, most))
+    # A replicate takes a power of two of paths, as Sobol' points need: the largest that
+    # allows as many replicates as by default. Paths that are left over make further
+    # replicates.
+    most_of_replicate = num_affordable // default.replicates
     num_paths = 2 ** (most_of_replicate.bit_length() - 1)
-    replicates = int(num_affordable) // num_paths
+    replicates = num_affordable // num_paths
     return ArrayRQMC(num_paths, _MOST_SAMPLES if tol else replicates)
 
 

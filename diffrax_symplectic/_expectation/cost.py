@@ -80,7 +80,8 @@ def _first_step(problem: Problem, y: Y) -> tuple[Y, Bool[Array, ""]]:
 
 
 def _count_operations(jaxpr: Jaxpr) -> int:
-    """The number of operations in a program, with the programs inside it."""
+    """The number of operations on single numbers in a program, with the programs inside
+    it."""
     # The compiler leaves out what no result needs. For example, the program of a sweep over
     # the momenta contains the velocity, which only a sweep over the positions would use.
     jaxpr, _ = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
@@ -88,15 +89,17 @@ def _count_operations(jaxpr: Jaxpr) -> int:
 
 
 def _operations_of(eqn: Any) -> int:
-    """The number of operations that an operation on arrays consists of."""
+    """The number of operations on single numbers that an operation on arrays consists of:
+    for a loop, a call or a conditional those of the programs inside it, and otherwise the
+    cost for each number by the tables above, times how many numbers there are."""
     name = eqn.primitive.name
     inner_programs = programs_in(eqn)
     if inner_programs:
         passes = 1
         if name == "scan":
             passes = eqn.params["length"]
-        # A loop around another one runs it again only if it has not finished, which is
-        # rare, so it counts as one pass.
+        # A loop of unknown length. Around another such loop it counts as one pass, since it
+        # runs again only if the inner loop has not finished, which is rare.
         elif name == "while" and not any(map(_has_loop, inner_programs)):
             passes = _PASSES
         # In a batch all branches of a conditional are evaluated.
@@ -113,7 +116,7 @@ def _operations_of(eqn: Any) -> int:
     )
     cost_of_number = _COMPLEX_PER_REAL if is_complex else 1
     if name == "dot_general":
-        # Each entry of the result is a sum over the contracted axes.
+        # Each entry of the result is a sum of products over the contracted axes.
         (contracted_axes, _), _ = eqn.params["dimension_numbers"]
         shape = eqn.invars[0].aval.shape
         num_products = size * math.prod(shape[axis] for axis in contracted_axes)
@@ -131,4 +134,5 @@ def _has_loop(jaxpr: Jaxpr) -> bool:
 
 
 def _size(variable: Any) -> int:
+    """The number of entries of an array."""
     return math.prod(variable.aval.shape)

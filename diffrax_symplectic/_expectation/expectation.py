@@ -37,7 +37,7 @@ from .estimate import (
     needs_level,
 )
 from .fast_drive import unresolved_drive
-from .finer_level import trial_with_finer_level
+from .finer_level import trial_with_finer_level, Verdict
 from .fused_paths import FusedPaths
 from .jumps import jumps_at_step_ends, jumps_within_steps
 from .kinks import has_kinks
@@ -49,7 +49,7 @@ from .long_steps import (
 from .out_of_range import is_finite_at_start, out_of_range
 from .progress import NO_METER, Progress
 from .run import Kept, run
-from .sampling import AbstractSampling
+from .sampling import AbstractSampling, SamplingPlan
 from .strong_friction import unresolved_friction
 
 
@@ -200,7 +200,8 @@ def expectation(
     key, first, devices = checked_call(
         "expectation", key, tol, start, first, devices, other_arguments
     )
-    # To continue `start`, an estimate must have the same levels.
+    # Levels are added to reach `tol`, unless the user chose their number. To continue
+    # `start`, an estimate must have the same levels.
     may_add_levels = levels is None and start is None
     if levels is None:
         levels = _FEWEST_LEVELS if start is None else start.levels
@@ -228,10 +229,10 @@ def expectation(
                 digests=problem.digests,
                 ts=times,
             )  # fmt: skip
-            if tol is None or not may_add_levels or levels == _MOST_LEVELS:
+            is_last = not may_add_levels or levels == _MOST_LEVELS
+            if tol is None or is_last or not needs_level(estimate, tol):
                 break
-            if not needs_level(estimate, tol):
-                break
+            # With another level all samples are taken anew.
             levels += 1
 
         progress.stage("checking the steps")
@@ -246,17 +247,9 @@ def expectation(
         # The steps are checked with the first samples of a problem, and not again with
         # later parts.
         if start is None and first == 0:
-            messages: list[str | None] = [*messages_on_steps(problem, dt0)]
-            # A trial takes longer than the checks, and does not name the cause.
-            if levels == 2 and not messages:
-                verdict = trial_with_finer_level(estimate, problem, plan, key, devices)
-                messages.append(verdict.warning)
-                estimate = dataclasses.replace(estimate, caveat=verdict.caveat)
-            if has_kinks(problem):
-                messages.append(
-                    _message_on_discrete_increments(estimate, problem, key, devices)
-                )
-            for message in filter(None, messages):
+            messages, caveat = _step_checks(estimate, problem, plan, key, devices, dt0)
+            estimate = dataclasses.replace(estimate, caveat=caveat)
+            for message in messages:
                 warnings.warn(message, stacklevel=2)
             warn_of_truncation(problem.terms, dt0, stacklevel=2)
     return estimate
@@ -266,7 +259,10 @@ def _messages_on_result(
     estimate: Expectation, problem: Problem, tol: float | None, dt0: float
 ) -> list[str]:
     """Warnings of what is wrong with the numbers of an estimate: failed paths, numbers out
-    of range, an error bar that may be too small, and rounding."""
+    of range, an error bar that may be too small, and rounding.
+
+    If most paths fail, the warning of failed paths names the most likely cause: a number
+    that is out of range, or else explicit steps that are too long."""
     # `num_paths` counts the paths that did not fail.
     most_fail = estimate.num_failed > estimate.num_paths
     lost_numbers = out_of_range(problem, most_fail)
@@ -276,6 +272,8 @@ def _messages_on_result(
     is_explicit = not problem.is_implicit and constraint_of(problem.terms) is None
     # If even the first evaluation fails, the length of steps is not the cause.
     if most_fail and is_explicit and is_finite_at_start(problem):
+        # A quarter of `dt0`, or if that is shorter, the step that turns the state by one
+        # radian.
         shorter = dt0 / max(4, unresolved_angle(problem) or 0)
         advice = (
             f"Most likely, steps of `dt0={dt0:g}` are too long for "
@@ -287,18 +285,66 @@ def _messages_on_result(
     return [message for message in messages if message is not None]
 
 
+def _message_on_rounding(estimate: Expectation, problem: Problem) -> str | None:
+    """A warning that rounding in single precision may exceed the sampling error; `None` if
+    it does not."""
+    precision = np.finfo(problem.dtype)
+    if precision.bits >= 64:
+        return None
+    # In each step the step size has the same rounding error, at most `eps` of it. So the
+    # errors add up to `eps` times the number of steps, as a fraction of the mean.
+    fraction = float(precision.eps) * problem.finest_steps
+    # No estimate reports a standard error below this floor (see `rounding_floor`). Rounding
+    # may be most of a standard error up to twice the floor.
+    floor = fraction * np.abs(estimate.vectors.mean)
+    if not np.any(estimate.vectors.std_error <= 2 * floor):
+        return None
+    return (
+        "Rounding errors may be larger than the sampling error: over "
+        f"{problem.finest_steps:,} steps in {precision.dtype} they are about "
+        f"{fraction:.0e} of the mean, which is the smallest `std_error` reported. For more "
+        'digits call `jax.config.update("jax_enable_x64", True)` first.'
+    )
+
+
+def _step_checks(
+    estimate: Expectation,
+    problem: Problem,
+    plan: SamplingPlan,
+    key: PRNGKeyArray,
+    devices: Devices,
+    dt0: float,
+) -> tuple[list[str], str]:
+    """Warnings of errors that come from the steps, or from discrete increments, and that
+    the error of the estimate may not include; and its `caveat`, which is empty or says
+    which errors a trial could not see."""
+    on_steps = messages_on_steps(problem, dt0)
+    verdict = Verdict()
+    # Where these checks find nothing, a trial may. It takes longer, and does not name the
+    # cause. Three levels need no trial.
+    if len(problem.levels.h) == 2 and not on_steps:
+        verdict = trial_with_finer_level(estimate, problem, plan, key, devices)
+    on_increments = _message_on_increments(estimate, problem, key, devices)
+    messages = [*on_steps, verdict.warning, on_increments]
+    return [message for message in messages if message is not None], verdict.caveat
+
+
 def messages_on_steps(problem: Problem, dt0: float) -> list[str]:
     """Warnings of what is wrong with the steps, where the error of the estimate may not
-    show it."""
+    include it. Each check looks at the problem alone, without taking samples:
+
+    - With one level there is no check, as the error does not claim to include the
+        discretization error.
+    - With two levels there are all checks.
+    - With more levels the order of convergence is checked anyway, which shows what some of
+        the checks look for. These are left out."""
     levels = len(problem.levels.h)
-    # With one level, the error does not claim to include the discretization error.
     if levels == 1:
         return []
     found = [
         jumps_within_steps(problem) or unresolved_drive(problem),
         too_long_steps(problem, dt0),
     ]
-    # With three levels the order is checked, which shows the errors of these checks.
     if levels == 2:
         found += [
             unresolved_noise(problem, dt0),
@@ -308,15 +354,18 @@ def messages_on_steps(problem: Problem, dt0: float) -> list[str]:
     return [message for message in found if message is not None]
 
 
-def _message_on_discrete_increments(
+def _message_on_increments(
     estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: Devices
 ) -> str | None:
-    """A warning that discrete increments give a wrong mean of a `phi` that may not be
-    smooth; `None` if increments are not discrete, or a trial with Gaussian increments has
-    the same mean. For solvers that take discrete increments only, there is no trial."""
+    """A warning that discrete increments give a wrong mean of a `phi` that is not smooth;
+    `None` if `phi` is smooth, increments are not discrete, or a trial with Gaussian
+    increments has the same mean. For solvers that take discrete increments only, there is a
+    warning without a trial."""
     paths = random_paths(problem.terms)
+    # A path that states no laws does not count as discrete.
     laws = [law for path in paths for law in (laws_of(path) or {}).values()]
-    if not any(isinstance(law, Discrete) for law in laws):
+    are_discrete = any(isinstance(law, Discrete) for law in laws)
+    if not are_discrete or not has_kinks(problem):
         return None
     if has_discrete_increments(problem.solver):
         return (
@@ -324,7 +373,7 @@ def _message_on_discrete_increments(
             "increments alone, which have the right means of smooth functions only. Pass "
             'a solver of `suggest_solver(terms, t0, y0, args, want="strong")`.'
         )
-    # Paths of the same Brownian motion get Gaussian paths of the same one.
+    # Where several terms share a Brownian motion, their Gaussian paths share one, too.
     gaussian_path = ft.partial(own_path, problem.solver, "strong")
     terms = with_paths(gaussian_path, motion_numbers(paths), problem.terms, key)
     gaussian_problem = dataclasses.replace(problem, terms=terms)
@@ -344,25 +393,4 @@ def _message_on_discrete_increments(
         "`ValueFunctions`) are for smooth functions. Pass the shape in place of the path "
         "in `terms`, or a `FixedStepBrownianPath`, and another `sampling` than "
         "`ValueFunctions`."
-    )
-
-
-def _message_on_rounding(estimate: Expectation, problem: Problem) -> str | None:
-    """A warning that rounding in single precision may exceed the sampling error; `None` if
-    it does not."""
-    precision = np.finfo(problem.dtype)
-    if precision.bits >= 64:
-        return None
-    # The rounding error of a step size is the same in all steps, so these errors add up.
-    fraction = float(precision.eps) * problem.finest_steps
-    # No estimate reports a standard error below this floor (see `rounding_floor`). Rounding
-    # may be most of a standard error up to twice the floor.
-    floor = fraction * np.abs(estimate.vectors.mean)
-    if not np.any(estimate.vectors.std_error <= 2 * floor):
-        return None
-    return (
-        "Rounding errors may be larger than the sampling error: over "
-        f"{problem.finest_steps:,} steps in {precision.dtype} they are about "
-        f"{fraction:.0e} of the mean, which is the smallest `std_error` reported. For more "
-        'digits call `jax.config.update("jax_enable_x64", True)` first.'
     )

@@ -1,4 +1,8 @@
-"""Whether forces or noise change in time too fast for the steps."""
+"""Whether forces or noise change in time too fast for the steps.
+
+A field here is a vector field of the problem, as a function of time and state. It is
+compared, at many times within each step, with a straight line.
+"""
 
 import functools as ft
 
@@ -57,6 +61,7 @@ def unresolved_drive(problem: Problem) -> str | None:
     if not depends_on_time(field, problem.t0, problem.y0):
         return None
     departure = _departure(field, problem.y0, _times_in_steps(problem))
+    # A departure that is NaN gives no warning.
     if not float(departure) > _MOST_DEPARTURE:
         return None
     h = float(problem.levels.h[-1])
@@ -69,8 +74,9 @@ def unresolved_drive(problem: Problem) -> str | None:
 
 
 def _times_in_steps(problem: Problem) -> Float[np.ndarray, "steps times"]:
-    """The times to look at: many in each of the shortest steps, or in some of these steps
-    from all over the interval."""
+    """The times to look at, with a row for each step: many in each of the shortest steps,
+    or if there are too many of these, in some from all over the interval."""
+    # The most times of all steps together.
     most_times = min(_MOST_TIMES, _MOST_NUMBERS // max(problem.num_components, 1))
     most_steps = max(_FEWEST_STEPS, most_times // _FEWEST_TIMES_IN_STEP)
     step_numbers = np.arange(problem.finest_steps)
@@ -81,6 +87,7 @@ def _times_in_steps(problem: Problem) -> Float[np.ndarray, "steps times"]:
     # Times within a step, as fractions of it. The first point, which is the start of the
     # step, is left out: a jump there would belong to the step before.
     fractions = np.sort(spread_evenly(times_in_step + 1)[1:])
+    # Time in units of a step, counted from `t0`.
     in_steps = step_numbers[:, None] + fractions
     times = float(problem.t0) + float(problem.levels.h[-1]) * in_steps
     return times.astype(problem.dtype)
@@ -93,7 +100,9 @@ def _departure(
     """The departure of a field from a straight line over each step, divided by its
     departure from its mean over the step, both in the root mean square over all steps; zero
     if the field changes little. The line joins the values at the first and the last of the
-    `times` in a step."""
+    `times` in a step. If steps resolve the field, it is almost a straight line over each,
+    and the result is small."""
+    # The field at `y0` and at another state, as one vector for each time.
     values_at = at_both_states(field, y0)
 
     def squares(times: Float[Array, " times"]) -> Float[Array, "3"]:

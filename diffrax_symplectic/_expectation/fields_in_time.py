@@ -1,6 +1,7 @@
 """The vector fields of a problem as functions of time, each as one vector."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.flatten_util as jfu
@@ -46,9 +47,22 @@ def forces(drift: Terms, args: Args, t: Array, y: Y) -> Float[Array, " n"]:
 
 def noise_change(noise: Terms, args: Args, t: Array, y: Y) -> Float[Array, " n"]:
     """The change of the state by noise, for arbitrary increments of about size one."""
+    change, zeros = change_by_increments(noise, args, t)
+    increments = arbitrary_direction(zeros.size, zeros.dtype)
+    return jfu.ravel_pytree(change(y, increments))[0]
+
+
+def change_by_increments(
+    noise: Terms, args: Args, t: Any
+) -> tuple[Callable[[Y, Array], Y], Float[Array, " m"]]:
+    """The function from a state and the increments of the noise, as one vector, to the
+    change of the state; and a vector of increments that are zero."""
     zeros, unravel = zeros_and_unravel([control_struct(term, t) for term in noise])
-    controls = unravel(arbitrary_direction(zeros.size, zeros.dtype))
-    return jfu.ravel_pytree(apply(noise, controls, args, t, y))[0]
+
+    def change(y: Y, increments: Float[Array, " m"]) -> Y:
+        return apply(noise, unravel(increments), args, t, y)
+
+    return change, zeros
 
 
 def all_fields(problem: Problem) -> Field:
@@ -79,22 +93,23 @@ def depends_on_time(field: Field, t0: Float[Array | np.ndarray, ""], y0: Y) -> b
 def at_both_states(
     field: Field, y0: Y
 ) -> Callable[[Float[Array, " times"]], Float[Array, "times n"]]:
-    """A function of times that returns the values of the field at two states, as one vector
-    for each time. The states are `y0`, and an arbitrary state about as far from `y0` as
-    `y0` is from zero. (At `y0` alone a change may not show: in a trap that is stiffened,
+    """A function of times that returns the values of the field at two states, joined to one
+    vector for each time. The states are `y0`, and an arbitrary state about as far from `y0`
+    as `y0` is from zero. (At `y0` alone a change may not show: in a trap that is stiffened,
     the force on a particle at its centre is always zero.)"""
 
     def with_moved(x: PyTree[Array]) -> Array:
+        """An array of `y0`, and the array of the other state, along a leading axis."""
         x = jnp.asarray(x)
         largest = jnp.max(jnp.abs(x), initial=0)
         size = jnp.where(largest > 0, largest, 1)
         direction = arbitrary_direction(x.size, x.dtype)
         return jnp.stack([x, x + size * direction.reshape(x.shape)])
 
-    both = jtu.tree_map(with_moved, y0)
+    both_states = jtu.tree_map(with_moved, y0)
 
     def at_both(t: Array) -> Float[Array, " n"]:
-        return jax.vmap(field, in_axes=(None, 0))(t, both).reshape(-1)
+        return jax.vmap(field, in_axes=(None, 0))(t, both_states).reshape(-1)
 
     return jax.vmap(at_both)
 

@@ -88,11 +88,14 @@ def trial_with_finer_level(
         programs are compiled already. A change of ten errors is then visible. A smaller
         change remains possible, so sorted paths whose steps may miss a rotation get a trial
         of the first kind."""
-    # Of paths with an unknown law nothing is known on a finer level.
+    # The law of a path of the user's own class is unknown, and may be another one on a
+    # finer level.
     if any(map(has_unknown_law, brownian_paths(problem.terms))):
         return Verdict()
     key = trial_key(key)
     is_fitted = isinstance(estimate.sampling, ValueFunctions)
+    # The angle by which a step turns the state, if it is so large that steps may miss a
+    # rotation.
     angle = unresolved_angle(problem)
     if plan.with_halved_steps is not None and (is_fitted or angle is None):
         changes = _changes_by_same_sampling(estimate, plan, key, devices)
@@ -144,7 +147,15 @@ class _Changes(NamedTuple):
 def _verdict(
     estimate: Expectation, problem: Problem, changes: _Changes, angle: float | None
 ) -> Verdict:
-    """What the changes say of an estimate. `angle` is that of `unresolved_angle`."""
+    """What the changes say of an estimate:
+
+    - If a change surely exceeds its error, there is a warning.
+    - If the noise of the trial would hide such a change, there is a caveat; or instead a
+        warning, if the steps may also miss a rotation.
+    - Otherwise nothing.
+
+    `angle` is the angle by which a step turns the state, or `None` if it is too small to be
+    missed."""
     advice = "Pass a smaller `dt0`, or `levels=3`, which checks the order."
     if changes.are_sure:
         worst = int(np.argmax(changes.excess))
@@ -156,15 +167,14 @@ def _verdict(
             f"{changes.std_errors[worst]:.1g}, which is more than its error, "
             f"{changes.errors[worst]:.1g}. {advice}"
         )
-    # Beside the errors of value functions, the noise of the trial is always large. A caveat
-    # would say little of steps that are resolved.
+    # Beside the errors of value functions, the noise of a trial is always large, so that a
+    # caveat would say nothing of the steps.
     is_fitted = isinstance(estimate.sampling, ValueFunctions)
     if is_fitted or not changes.are_hidden:
         return Verdict()
     caveat = _caveat(estimate, changes)
     if angle is None:
         return Verdict(caveat=caveat)
-    # Steps may miss a rotation, and the trial is too noisy to tell.
     return Verdict(
         warning=f"Steps of `dt0={float(problem.levels.h[0]):g}` are long, omega h = "
         f"{angle:.3g} for the largest frequency of the drift where paths start, and two "
@@ -185,10 +195,10 @@ def _caveat(estimate: Expectation, changes: _Changes) -> str:
 def _changes_on_same_noise(
     estimate: Expectation, problem: Problem, key: PRNGKeyArray, devices: Devices
 ) -> _Changes | None:
-    """The changes by a third level, on independent paths with the same noise on all levels
-    if possible. More and more paths are taken until the changes are sure, or the noise does
-    not hide changes as large as the errors. `None` if the estimate has too few paths for a
-    trial, or if too many paths of the trial fail."""
+    """The changes by a third level, on independent paths, if possible with the same noise
+    on all levels. There are trials of more and more paths, until a change is sure, or the
+    statistical noise of the trial does not hide changes as large as the errors. `None` if
+    the estimate has too few paths for a trial, or if too many paths of a trial fail."""
     # All trials take batches of the same size, so that they share a program. The user may
     # have chosen a smaller size, for example to save memory.
     batch_size = _PATHS_OF_TRIALS[0]
@@ -261,13 +271,14 @@ def _with_finer_level(problem: Problem, key: PRNGKeyArray) -> Problem:
 def _changes_by_same_sampling(
     estimate: Expectation, plan: SamplingPlan, key: PRNGKeyArray, devices: Devices
 ) -> _Changes | None:
-    """The changes by halved steps on both levels, on samples of the same kind as those of
-    the estimate. `None` if too many paths of the trial fail."""
+    """The changes by halved steps: the difference between the mean of the estimate, and the
+    mean of a trial by the same sampling in which the steps of both levels are half as long.
+    `None` if too many paths of the trial fail."""
     assert plan.with_halved_steps is not None
     # At least two samples, for a standard error; and at least a whole batch, since a part
     # of one takes as long.
-    share = int(_SHARE_OF_FIRST_TRIAL * estimate.num_samples)
-    num_samples = max(2, plan.batch_size, share)
+    most_by_share = int(_SHARE_OF_FIRST_TRIAL * estimate.num_samples)
+    num_samples = max(2, plan.batch_size, most_by_share)
     trial_plan = plan.with_halved_steps()._replace(
         num_samples=num_samples, is_quick=plan.is_quick
     )
@@ -278,8 +289,8 @@ def _changes_by_same_sampling(
     of_trial = trial.vectors
     # The standard error of so few samples may come out far too small. So it is taken to be
     # at least that of as many samples of the estimate.
-    least = of_estimate.std_error * np.sqrt(estimate.num_samples / num_samples)
-    trial_std_error = np.maximum(least, of_trial.std_error)
+    least_error = of_estimate.std_error * np.sqrt(estimate.num_samples / num_samples)
+    trial_std_error = np.maximum(least_error, of_trial.std_error)
     return _Changes(
         sizes=np.abs(of_trial.mean - of_estimate.mean),
         std_errors=np.hypot(of_estimate.std_error, trial_std_error),

@@ -9,10 +9,10 @@ import jax.tree_util as jtu
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key, PRNGKeyArray, PyTree
 
-from .._custom_types import Devices
+from .._custom_types import Args, Devices
 from .._simulation import by_drjit, Level, Problem, state_itself
 from .independent import IndependentPaths, samples_of_paths
-from .sampling import Outputs, Samples, SamplingPlan
+from .sampling import Samples, SamplingPlan
 
 
 # The default number of paths in a batch. It is large, since each call of the kernel takes a
@@ -36,15 +36,13 @@ def fused_plan(
             f'`engine="drjit"` uses all cores, or one GPU; got {len(devices)} devices. '
             "Pass `devices=jax.devices()[:1]`."
         )
-    plan = sampling.plan(
-        jtu.Partial(_samples_of_fused_paths, problem),
-        Outputs.of(problem),
-        devices,
-        problem.bytes_of_state,
-    )
+    plan = sampling.prepare(problem, key, devices)
     if sampling.batch_size is None:
         plan = plan._replace(batch_size=_FUSED_BATCH)
-    return plan._replace(simulate_paths=FusedPaths(problem, key))
+    return plan._replace(
+        sampler=jtu.Partial(_samples_of_fused_paths, problem),
+        simulate_paths=FusedPaths(problem, key),
+    )
 
 
 class FusedPaths:
@@ -64,9 +62,9 @@ class FusedPaths:
         self.num_stragglers = 0
 
     def __call__(self, first: int, num_samples: int) -> tuple[PyTree, np.ndarray]:
-        """Simulates the paths of this number of samples, from sample number `first` on.
-        Returns their states at the saved times, with axes for levels, paths and times; and
-        which paths failed, with axes for levels and paths."""
+        """Simulates as many paths as there are samples, from sample number `first` on, on
+        each level. Returns their states at the saved times, with axes for levels, paths and
+        times; and which paths failed, with axes for levels and paths."""
         sample_numbers = np.arange(first, first + num_samples, dtype=np.uint64)
         batches = [
             by_drjit(self._problem, self._key, sample_numbers, level)
@@ -92,9 +90,7 @@ def _samples_of_fused_paths(
     states, failed = paths
     _, args_of_paths = jax.vmap(problem.draw_start)(keys)
 
-    def values_of_path(
-        times: Any, y: PyTree[Array], own_args: PyTree[Array]
-    ) -> Float[Array, "S m"]:
+    def values_of_path(times: Any, y: PyTree, own_args: Args) -> Float[Array, "S m"]:
         """The values of `phi` on a path with the states `y` at all times."""
         return jax.vmap(problem.with_args(own_args).values)(times, y)
 

@@ -62,10 +62,10 @@ def jumps_within_steps(problem: Problem) -> str | None:
     """A warning if forces or noise jump in time within one of the shortest steps, away from
     its ends; `None` if they do not.
 
-    Any solver makes an error of first order at such a jump, as if the jump were at an end
-    of the step. If this is the same time on all levels, so is the error, and they agree on
-    a wrong mean. A jump at a random time, which differs between paths, does not count,
-    since the errors of the paths average out."""
+    At such a jump any solver makes an error of first order, as if the jump came at another
+    time of the step, such as an end. If this time is the same on all levels, so is the
+    error, and they agree on a wrong mean. A jump at a random time, which differs between
+    paths, does not count, since the errors of the paths average out."""
     if not depends_on_time(all_fields(problem), problem.t0, problem.y0):
         return None
     steps = _steps_to_look_at(problem)
@@ -77,7 +77,7 @@ def jumps_within_steps(problem: Problem) -> str | None:
     if problem.args_of is not None and times.size:
         _, other_args = problem.draw_start(jr.key(2))
         other_times = _times_of_jumps(problem.with_args(other_args), steps)
-        # (jumps of the first draw, jumps of the second)
+        # With a row for each jump of the first draw, a column for each of the second.
         are_equal = np.abs(times[:, None] - other_times) < steps.far
         times = times[np.any(are_equal, axis=1)]
     if not times.size:
@@ -96,8 +96,8 @@ def jumps_at_step_ends(problem: Problem) -> str | None:
     At the time of its jump a field has a single value, such as that of the side before. The
     step that ends at this time and the step that begins at it both take this value, and for
     one of them it is wrong. So the mean converges with order 1. But two levels extrapolate
-    by the order of the solver: if it is 2, they report less than the error. Solvers of
-    order 1 are left out.
+    by the order of the solver: if it is 2, they report less than the error. For solvers of
+    order 1 there is no check.
 
     It is enough to look at the ends of the shortest steps: they include the ends and the
     middles of all others."""
@@ -135,7 +135,8 @@ class _AtEnds(NamedTuple):
 
 
 def _kicks_at_ends(problem: Problem, solver: AbstractLangevinSplitting) -> _AtEnds:
-    """The forces of a splitting whose steps begin and end with a kick."""
+    """The forces of a splitting whose steps begin and end with a kick, a change of the
+    momenta by forces alone."""
     # Diffrax's Langevin terms have the velocity last, and kicks are made of terms that have
     # it first.
     terms, y0 = momentum_first(problem.terms, problem.y0)
@@ -156,23 +157,23 @@ def _stages_at_ends(problem: Problem, solver: AbstractSymplecticRungeKutta) -> _
     the end of a step."""
     drift, noise = split_terms(without_constraint(problem.terms))
     stages = solver.tableau.flatten().stages
+    # Without a stated weak order, two levels extrapolate by order 1.
+    if solver.weak_order(problem.terms) in (1, None):
+        stages = ()
+    # `stage.c` is the time of a stage, as a fraction of the step.
     stages_at_ends = [stage for stage in stages if stage.c in (0, 1)]
-    # All other stages evaluate noise.
+    # Stages with the step size as their control evaluate the drift, all others noise.
     drift_stages = [stage for stage in stages_at_ends if stage.channels == ("h",)]
     has_noise_stages = len(drift_stages) < len(stages_at_ends)
     # Stages that change positions alone evaluate velocities, which do not depend on time.
     has_force_stages = any(stage.writes != "q" for stage in drift_stages)
-    # Without a stated weak order, two levels extrapolate by order 1, too.
-    is_of_order_1 = solver.weak_order(problem.terms) in (1, None)
     fields = {}
-    if drift and has_force_stages and not is_of_order_1:
+    if drift and has_force_stages:
         fields["forces jump"] = jtu.Partial(drift_rate, drift, problem.args)
-    if noise and has_noise_stages and not is_of_order_1:
+    if noise and has_noise_stages:
         fields["noise jumps"] = jtu.Partial(noise_change, noise, problem.args)
-    cure = (
-        "Pass a solver that takes forces and noise within steps, such as "
-        "`ImplicitMidpoint()`"
-    )
+    cure = "Pass a solver that takes forces and noise within steps, such as "
+    cure += "`ImplicitMidpoint()`"
     return _AtEnds(fields, problem.y0, cure)
 
 
@@ -183,8 +184,9 @@ class _Steps(NamedTuple):
     - `near`: a span of time just longer than the rounding errors of times.
     - `far`: a longer span, over which smooth fields still change little.
 
-    A field jumps at a time `t` if it changes far more from `t - near` to `t + near` than
-    from `t - far` to `t - near` and from `t + near` to `t + far`.
+    A field jumps at a time `t` if it changes far more from just before it to just after it,
+    from `t - near` to `t + near`, than from `t - far` to `t - near` and from `t + near` to
+    `t + far`.
     """
 
     starts: Float[np.ndarray, " steps"]
@@ -216,28 +218,30 @@ def _steps_to_look_at(problem: Problem) -> _Steps | None:
 def _times_of_jumps(problem: Problem, steps: _Steps) -> Float[np.ndarray, " jumps"]:
     """The times at which the forces or the noise jump within steps, away from their
     ends."""
-    # Both ends of a step are left out: a jump that is this near to an end does as little
-    # harm as one at the end.
+    # Steps are searched without both ends: a jump that is this near to an end does as
+    # little harm as one at the end.
     interior = np.array([steps.far, steps.h - steps.far])
     interiors = (steps.starts[:, None] + interior).astype(problem.dtype)
     # A part of a step is bisected until it is no longer than `near`.
     halvings = max(0, int(np.ceil(np.log2(steps.h / _PARTS_OF_STEP / steps.near))))
     around = steps.around.astype(problem.dtype)
-    found = _search(all_fields(problem), problem.y0, interiors, halvings, around)
-    times, is_jump = map(np.asarray, found)
-    return times[is_jump]
+    times, jumps = _search(all_fields(problem), problem.y0, interiors, halvings, around)
+    return np.asarray(times)[np.asarray(jumps)]
 
 
 def _first_jump_at_end(field: Field, problem: Problem, y0: Y) -> float | None:
-    """The first end of a step at which a field jumps; `None` if there is none. The start of
-    the first step is not looked at, since paths see only the side after it."""
+    """The first end of a step at which a field jumps and does not have the mean of the
+    values on both sides; `None` if there is none. The start of the first step is not looked
+    at, since paths see only the side after it."""
     if not depends_on_time(field, problem.t0, y0):
         return None
     steps = _steps_to_look_at(problem)
     if steps is None:
         return None
     ends = steps.starts + steps.h
+    # Whether an end is that of the path, which may have more steps than are looked at.
     is_last = np.arange(1, len(ends) + 1) == problem.finest_steps
+    # For each end the four times around it, and the end itself.
     times = (ends[:, None] + np.append(steps.around, 0)).astype(problem.dtype)
     jumps = _jumps_at_ends(field, y0, times, is_last)
     return float(ends[np.argmax(jumps)]) if np.any(jumps) else None
@@ -261,12 +265,20 @@ def _search(
     halvings: int,
     around: Float[Array, "4"],
 ) -> tuple[Float[Array, " searched"], Bool[Array, " searched"]]:
-    """Searches for jumps of a field in the intervals, each a start and an end, over which
-    the field changes most. Returns for each interval that is searched the time at which the
-    field changes fastest, and whether it jumps there.
+    """Searches for jumps of a field in time, at most one in each interval:
 
-    - `halvings`: how often a part of an interval is bisected.
+    1. Choose the intervals over which the field changes most.
+    2. Divide each of them into parts, and choose the part over which the field changes
+       most. Bisect it `halvings` times, each time into the half over which the field
+       changes more. What remains is the time at which the field changes fastest.
+    3. The field jumps at this time if its change from just before to just after is too
+       large for a smooth field.
+
+    Returns for each chosen interval the time, and whether the field jumps there.
+
+    - `intervals`: the start and the end of each interval.
     - `around`: the times `_Steps.around`."""
+    # The field at `y0` and at another state, as one vector for each time.
     values_at = at_both_states(field, y0)
 
     def changes(times: Float[Array, " times"]) -> Float[Array, " times-1"]:
@@ -283,8 +295,8 @@ def _search(
 
     def half_that_changes_more(_, interval: Float[Array, "2"]) -> Float[Array, "2"]:
         times = with_middle(interval)
-        in_first, in_second = changes(times)
-        return jnp.where(in_first >= in_second, times[:2], times[1:])
+        first_change, second_change = changes(times)
+        return jnp.where(first_change >= second_change, times[:2], times[1:])
 
     def jump_in(interval: Float[Array, "2"]) -> tuple[Array, Bool[Array, ""]]:
         """The time at which the field changes fastest, and whether it jumps there."""
@@ -293,38 +305,39 @@ def _search(
         part = times[jnp.argmax(changes(times)) + jnp.arange(2)]
         time = jnp.mean(lax.fori_loop(0, halvings, half_that_changes_more, part))
         sides = values_at(time + around)
-        change = jnp.linalg.norm(sides[2] - sides[1])
+        _, just_before, just_after, _ = sides
+        change = jnp.linalg.norm(just_after - just_before)
         return time, change > _largest_smooth_change(sides)
 
     largest_changes = lax.map(largest_change, intervals, batch_size=_STEPS_AT_ONCE)
     num_searched = min(_MOST_STEPS_SEARCHED, len(intervals))
-    _, which = lax.top_k(largest_changes, num_searched)
-    return jax.vmap(jump_in)(intervals[which])
+    _, chosen = lax.top_k(largest_changes, num_searched)
+    return jax.vmap(jump_in)(intervals[chosen])
 
 
 @ft.partial(compiled, quickly=True)
 def _jumps_at_ends(
     field: Field, y0: Y, times: Float[Array, "ends 5"], is_last: Bool[Array, " ends"]
 ) -> Bool[Array, " ends"]:
-    """For the end of each step, whether a field jumps there and has a wrong value at it.
-    The mean of both sides is a right value.
+    """For the end of each step, whether a field jumps there, and has a value at the end
+    itself with which steps are wrong. The steps before and after the end both take this
+    value, so the mean of the values just before and just after the end is right. If no step
+    follows, the value just before is right, too.
 
     - `times`: for each end the four times of `_Steps.around`, and the end itself.
     - `is_last`: whether no step follows."""
+    # The field at `y0` and at another state, as one vector for each time.
     values_at = at_both_states(field, y0)
 
     def jumps_at(end: tuple[Array, Array]) -> Bool[Array, ""]:
-        times_of_end, is_end_of_path = end
+        times_of_end, is_last_end = end
         values = values_at(times_of_end)
-        sides = values[:4]
-        _, just_before, just_after, _ = sides
-        at_end = values[4]
-        error = jnp.linalg.norm(at_end - (just_before + just_after) / 2)
-        # If no step follows, the value of the side before is right, too.
-        error_before = jnp.linalg.norm(at_end - just_before)
-        error = jnp.where(is_end_of_path, jnp.minimum(error, error_before), error)
+        _, just_before, just_after, _, at_end = values
+        from_mean = jnp.linalg.norm(at_end - (just_before + just_after) / 2)
+        from_before = jnp.linalg.norm(at_end - just_before)
+        error = jnp.where(is_last_end, jnp.minimum(from_mean, from_before), from_mean)
         # With the value of one side, the error is half of the jump. (If a value is NaN, the
         # comparison is false: that is no jump.)
-        return 2 * error > _largest_smooth_change(sides)
+        return 2 * error > _largest_smooth_change(values[:4])
 
     return lax.map(jumps_at, (times, is_last), batch_size=_STEPS_AT_ONCE)

@@ -29,7 +29,7 @@ def has_kinks(problem: Problem) -> bool:
 
 def may_have_kinks(fn: Callable, y: PyTree) -> bool:
     """Whether `fn(y)` depends on an operation on `y` that is not smooth, such as `abs`, a
-    maximum or a comparison. Some functions that do are smooth all the same."""
+    maximum or a comparison. Some functions with such operations are smooth all the same."""
     leaves, treedef = jtu.tree_flatten(y)
     traced = jax.make_jaxpr(lambda *leaves: fn(treedef.unflatten(leaves)))(*leaves)
     return _may_be_rough(traced.jaxpr)
@@ -47,8 +47,7 @@ def _may_be_rough(jaxpr: Jaxpr) -> bool:
         if not any(x in dependent for x in operands):
             continue
         dependent.update(eqn.outvars)
-        if eqn.primitive.name in _NOT_SMOOTH:
-            return True
-        if any(map(_may_be_rough, programs_in(eqn))):
+        is_rough = eqn.primitive.name in _NOT_SMOOTH
+        if is_rough or any(map(_may_be_rough, programs_in(eqn))):
             return True
     return False

@@ -53,17 +53,20 @@ class Growth(NamedTuple):
 def largest_growth(
     linear: Callable[[Array], Array], like: Float[Array, " n"], iterations: int
 ) -> Growth:
-    """The growth of the direction that a linear map enlarges most, by power iteration: this
-    many applications of the map find the direction, and as many more measure its growth."""
+    """The growth of the direction that a linear map enlarges most, by power iteration:
+    `iterations` applications of the map find the direction, and as many more measure its
+    growth. `like` is any vector that the map takes."""
 
-    def after_map(number: Array, before: Growth) -> Growth:
+    def after_map(iteration: Array, before: Growth) -> Growth:
         mapped = linear(before.direction)
         # The direction has length one, so this is the factor by which the length grows.
         length = jnp.linalg.norm(mapped)
-        counted_log = jnp.where(number < iterations, 0.0, jnp.log(length))
+        # The first half of the applications does not count.
+        counted_log = jnp.where(iteration < iterations, 0.0, jnp.log(length))
         log_growth = before.log_growth + counted_log / iterations
         rayleigh_quotient = before.direction @ mapped
-        # The map may be zero, as without a drift between two pulses.
+        # The map may be zero, as without a drift between two pulses. The direction then
+        # stays the same.
         scaled = jnp.where(length > 0, mapped / length, before.direction)
         return Growth(scaled, log_growth, rayleigh_quotient)
 

@@ -5,11 +5,11 @@ Four checks, each by power iteration or eigenvalues of a derivative at `y0`: exp
 must be stable, some solvers must resolve the largest frequency of the drift, implicit steps
 must let decaying modes decay, and noise must not turn the state far in a step. In an
 oscillation of angular frequency omega, a step of length h turns the state by the angle
-omega h.
+omega h. An angle may be NaN, as where `y0` is a singularity: it is compared by `not angle >
+most`, so that there is no warning.
 """
 
 import functools as ft
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -19,23 +19,25 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from .._brownian import zeros_and_unravel
 from .._compat import unwrapped
-from .._custom_types import Y
+from .._custom_types import Terms, Y
 from .._programs import compiled, once_for_each_signature
 from .._simulation import Problem
 from .._solver import AbstractLangevinSplitting, AbstractSymplecticSolver
 from .._terms import (
-    apply,
     BathNoise,
     brownian_paths,
     constraint_of,
-    control_struct,
     Dependence,
     has_unknown_law,
     split_friction,
 )
-from .fields_in_time import depends_on_time, drift_rate, spread_evenly
+from .fields_in_time import (
+    change_by_increments,
+    depends_on_time,
+    drift_rate,
+    spread_evenly,
+)
 from .linear_maps import Growth, largest_frequency, largest_growth, linearized
 
 
@@ -96,16 +98,17 @@ def too_long_steps(problem: Problem, dt0: float) -> str | None:
     if not problem.is_implicit:
         return _unstable_steps(problem, dt0)
     angle, step_number = _largest_angle(problem)
-    message = _unresolved_frequency(problem, dt0, angle, step_number)
-    return message or _missed_decay(problem, dt0, angle, step_number)
+    message = _unresolved_frequency(problem, dt0, step_number, angle)
+    return message or _missed_decay(problem, dt0, step_number, angle)
 
 
 def _unstable_steps(problem: Problem, dt0: float) -> str | None:
-    """A warning if an explicit step, with increments of zero, is unstable."""
+    """A warning if an explicit step, with increments of zero, is unstable: if it enlarges a
+    small change of the state, and turns it around."""
     step_numbers = _step_numbers_to_look_at(problem)
     growth = _growth_in_steps(problem, step_numbers)
-    # The step enlarges a small change, and turns it around.
     is_unstable = growth.log_growth > np.log(_UNSTABLE)
+    # The quotient is negative where the change is turned around.
     is_unstable &= growth.rayleigh_quotient < 0
     if not np.any(is_unstable):
         return None
@@ -118,10 +121,11 @@ def _unstable_steps(problem: Problem, dt0: float) -> str | None:
 
 
 def _unresolved_frequency(
-    problem: Problem, dt0: float, angle: float, step_number: np.floating
+    problem: Problem, dt0: float, step_number: np.floating, angle: float
 ) -> str | None:
-    """A warning if the largest angle by which the drift turns the state, in the step with
-    this number, is more than the `Record.most_frequency` of the solver."""
+    """A warning if the drift turns the state by a larger angle than the solver resolves,
+    its `Record.most_frequency`. `angle` is the largest angle, in the step with this number.
+    """
     assert isinstance(problem.solver, AbstractSymplecticSolver)
     record = problem.solver.record
     most_frequency = None if record is None else record.most_frequency
@@ -138,15 +142,16 @@ def _unresolved_frequency(
 
 
 def _missed_decay(
-    problem: Problem, dt0: float, angle: float, step_number: np.floating
+    problem: Problem, dt0: float, step_number: np.floating, angle: float
 ) -> str | None:
     """A warning if a mode decays, but implicit steps turn it so far that they hardly damp
     it. `angle` is the largest angle by which the drift turns the state, in the step with
     this number."""
-    # Eigenvalues take long. They are only computed if the drift turns the state this far.
+    # If the drift turns no mode this far, it turns no decaying mode this far, and the
+    # eigenvalues, which take long, are not computed.
     if not angle > _TURNS_TOO_FAR_TO_DECAY or problem.num_components > _MOST_MODES:
         return None
-    decaying_angle = _decaying_angle(problem, step_number, dt0)
+    decaying_angle = _decaying_angle(problem, dt0, step_number)
     if not decaying_angle > _TURNS_TOO_FAR_TO_DECAY:
         return None
     return (
@@ -169,17 +174,17 @@ def _too_long(problem: Problem, dt0: float, step_number: np.floating) -> str:
     return f"Steps of `dt0={dt0:g}` are too long for `{solver_name}` {where}"
 
 
-def _decaying_angle(problem: Problem, step_number: np.floating, dt0: float) -> float:
+def _decaying_angle(problem: Problem, dt0: float, step_number: np.floating) -> float:
     """The largest angle by which the step with this number turns a mode that decays; zero
     if none decays. The modes are those of the drift in the implicit equations of the step,
-    at `y0`."""
-    # A mode decays with the negative real part of its eigenvalue, and turns with the
-    # imaginary part.
+    at `y0`. A mode with the eigenvalue `-rate + i omega` decays at `rate`, and a step turns
+    it by the angle `|omega| dt0`."""
     jacobian = np.asarray(_jacobian_of_step(problem, step_number), float)
     eigenvalues = np.linalg.eigvals(jacobian)
     decay_rates = -eigenvalues.real
     duration = float(problem.level(0).num_steps) * dt0
     rounding = _ROUNDING_OF_RATES * np.max(np.abs(eigenvalues))
+    # Modes with lower rates do not count as decaying.
     least_rate = max(_LEAST_DECAY / duration, rounding)
     # Without friction, each mode that decays is paired with one that grows as fast, so that
     # the rates add up to zero.
@@ -244,21 +249,10 @@ def _step_numbers_to_look_at(problem: Problem) -> Float[np.ndarray, " times"]:
     return np.floor(spread_evenly(_NUM_TIMES) * num_steps).astype(problem.dtype)
 
 
-def _noise_of_user(
-    problem: Problem,
-) -> tuple[Callable[[Y, Array], Y], Float[Array, " m"]]:
-    """The function from a state and the increments of the noise, as one vector, to the
-    change of the state; and a vector of increments that are zero. The noise of heat baths,
-    which acts on momenta alone, is left out."""
+def _noise_of_user(problem: Problem) -> Terms:
+    """The noise without that of heat baths, which acts on momenta alone."""
     _, _, noise = split_friction(problem.terms)
-    noise = tuple(term for term in noise if not isinstance(unwrapped(term), BathNoise))
-    structs = [control_struct(term, problem.t0) for term in noise]
-    zeros, unravel = zeros_and_unravel(structs)
-
-    def change(y: Y, controls: Float[Array, " m"]) -> Y:
-        return apply(noise, unravel(controls), problem.args, problem.t0, y)
-
-    return change, zeros
+    return tuple(term for term in noise if not isinstance(unwrapped(term), BathNoise))
 
 
 @once_for_each_signature
@@ -266,51 +260,52 @@ def _noise_reads_state(problem: Problem) -> bool:
     """Whether the change of the state by noise depends on the state, apart from the noise
     of heat baths. This is whether its program reads the state: the derivative may be zero
     at `y0`."""
-    change, controls = _noise_of_user(problem)
-    if controls.size == 0:
+    noise = _noise_of_user(problem)
+    change, zeros = change_by_increments(noise, problem.args, problem.t0)
+    if zeros.size == 0:
         return False
-    dependence = Dependence(change, problem.y0, controls)
-    return not dependence.independent(lambda y, controls: y)
+    dependence = Dependence(change, problem.y0, zeros)
+    return not dependence.independent(lambda y, increments: y)
 
 
 @ft.partial(compiled, quickly=True)
-def _growth_in_steps(problem: Problem, numbers: Float[Array, " times"]) -> Growth:
+def _growth_in_steps(problem: Problem, step_numbers: Float[Array, " times"]) -> Growth:
     """For each of the steps with these numbers, taken from `y0` with increments of zero:
     the growth of the small change of `y0` that the step enlarges most."""
     h = problem.level(0).h
     variables = problem.variables(h)
     terms = variables.terms_with(jnp.zeros(len(variables.laws)))
 
-    def step(number: Float[Array, ""], y: Y) -> Y:
-        state = problem.init(terms, number, h, y)
-        y1, *_ = problem.step(terms, number, h, y, state)
+    def step(step_number: Float[Array, ""], y: Y) -> Y:
+        state = problem.init(terms, step_number, h, y)
+        y1, *_ = problem.step(terms, step_number, h, y, state)
         return y1
 
-    def growth_in_step(number: Float[Array, ""]) -> Growth:
-        derivative, flat_y0 = linearized(step, number, problem.y0)
+    def growth_in_step(step_number: Float[Array, ""]) -> Growth:
+        derivative, flat_y0 = linearized(step, step_number, problem.y0)
         return largest_growth(derivative, flat_y0, _ITERATIONS_FOR_INSTABILITY)
 
     # This compiles faster than `jax.vmap`, and takes less memory.
-    return lax.map(growth_in_step, numbers)
+    return lax.map(growth_in_step, step_numbers)
 
 
 @ft.partial(compiled, quickly=True)
 def drift_frequencies(
-    problem: Problem, numbers: Float[Array, " times"]
+    problem: Problem, step_numbers: Float[Array, " times"]
 ) -> Float[Array, " times"]:
     """The largest angular frequency of the drift without friction, at `y0` and the start
     of each of the steps with these numbers; zero where growth without oscillation is
     faster."""
     drift, _, _ = split_friction(problem.terms)
     if not drift:
-        return jnp.zeros_like(numbers)
+        return jnp.zeros_like(step_numbers)
+    field = jtu.Partial(drift_rate, drift, problem.args)
 
-    def frequency(number: Float[Array, ""]) -> Float[Array, ""]:
-        t = problem.t0 + number * problem.level(0).h
-        field = jtu.Partial(drift_rate, drift, problem.args)
+    def frequency(step_number: Float[Array, ""]) -> Float[Array, ""]:
+        t = problem.t0 + step_number * problem.level(0).h
         return largest_frequency(field, t, problem.y0)
 
-    return lax.map(frequency, numbers)
+    return lax.map(frequency, step_numbers)
 
 
 @ft.partial(compiled, quickly=True)
@@ -318,8 +313,8 @@ def _jacobian_of_step(
     problem: Problem, step_number: Float[Array, ""]
 ) -> Float[Array, "n n"]:
     """The derivative at `y0` of the drift in the implicit equations of the step with this
-    number. It contains the friction, except for splittings, which solve the friction by
-    itself."""
+    number, as a matrix. The drift contains the friction, except for splittings, which solve
+    the friction by itself."""
     drift, friction, _ = split_friction(problem.terms)
     if isinstance(problem.solver, AbstractLangevinSplitting):
         friction = ()
@@ -335,14 +330,14 @@ def _noise_frequency(problem: Problem) -> Float[Array, ""]:
     """The angle by which noise turns a small change of the state at `y0` within time 1, as
     a standard deviation. This is the largest angle over some random choices of the signs of
     the increments, each of which has the size of its standard deviation."""
-    change, zeros = _noise_of_user(problem)
+    noise = _noise_of_user(problem)
+    change, zeros = change_by_increments(noise, problem.args, problem.t0)
 
     def frequency(key: PRNGKeyArray) -> Float[Array, ""]:
-        controls = jr.rademacher(key, zeros.shape, zeros.dtype)
+        increments = jr.rademacher(key, zeros.shape, zeros.dtype)
 
-        def field(t: Array, y: Y) -> Y:
-            del t
-            return change(y, controls)
+        def field(_, y: Y) -> Y:
+            return change(y, increments)
 
         return largest_frequency(field, problem.t0, problem.y0)
 

@@ -154,8 +154,8 @@ def monte_carlo(
 
 
 def _outputs(programs: list[Traced], key: PRNGKeyArray) -> Outputs:
-    """What the numbers of phi are, by the program of each level. Raises a `ValueError`
-    unless phi has the same layout on all levels."""
+    """The layout, the levels and the dtype of the numbers of phi, which the program of each
+    level returns. Raises a `ValueError` unless the layout is the same on all levels."""
     structs = [jax.eval_shape(program, key)[0] for program in programs]
     layout, *other_layouts = map(Layout.of, structs)
     if any(other != layout for other in other_layouts):

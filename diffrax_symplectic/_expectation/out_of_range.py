@@ -43,17 +43,15 @@ def out_of_range(problem: Problem, all_fail: bool) -> str | None:
 
 
 def _lost_arguments(problem: Problem) -> Iterator[str]:
-    """Names each argument with an array in which some number is not zero, but all count as
-    zero, or some number is finite, but counts as infinite."""
+    """Names each argument with an array whose largest number, in size, is not zero but
+    counts as zero, or is finite but counts as infinite."""
     arguments = {"y0": problem.y0, "args": problem.args, "dt0": problem.levels.h[0]}
     _, noise = split_terms(problem.terms)
     for term in noise:
         if isinstance(term, BathNoise):
             arguments |= {"friction": term.friction, "temperature": term.temperature}
     for name, value in arguments.items():
-        for leaf in jtu.tree_leaves(value):
-            if not _is_float(leaf):
-                continue
+        for leaf in filter(_is_float, jtu.tree_leaves(value)):
             # Numbers of Python have the precision of the state.
             precision = jnp.finfo(jnp.result_type(leaf, problem.dtype))
             size = float(np.max(np.abs(_in_float64(leaf)), initial=0))
@@ -93,6 +91,7 @@ def _lost_on_the_way(problem: Problem) -> str | None:
 
     def results_of(eqn: Any, values: list[Any]) -> Sequence[Any]:
         name = eqn.primitive.name
+        # A call of another program, whose operations are evaluated one by one, too.
         if name in CALLS:
             return results_of_program(eqn.params[CALLS[name]], values, results_of)
         results = results_of_operation(eqn, values, eqn.params)
@@ -106,8 +105,8 @@ def _lost_on_the_way(problem: Problem) -> str | None:
 
 
 def _loss(name: str, values: list[Any], result: Any) -> str | None:
-    """The first entry of the result of an arithmetic operation that overflowed or
-    underflowed, such as `1e-30 * 1e-30 is 0`; `None` if no entry did."""
+    """Says of an arithmetic operation which entry of its result overflowed or underflowed,
+    such as `1e-30 * 1e-30 is 0`: the first; `None` if no entry did."""
     results = _in_float64(result)
     operands = [np.broadcast_to(_in_float64(x), results.shape) for x in values]
     # If an operand is already zero or infinite, the result may be so with nothing lost.

@@ -60,8 +60,8 @@ def run(
     kept: Kept | None = None,
     **fields: Any,
 ) -> Expectation:
-    """The estimate from the samples of a plan. The result does not depend on the number of
-    devices.
+    """The estimate from the samples of a plan, which are computed in batches. The result
+    does not depend on the number of devices.
 
     - `start`: an estimate to continue. Without it, samples begin with number `first`.
     - `tol`: the tolerance, with which fewer samples may be taken than the plan has.
@@ -77,30 +77,16 @@ def run(
             f"Samples have numbers below 2^63; got {plan.num_samples} from number {begin} "
             "on. Pass a smaller number of paths (or replicates), or a smaller `first`."
         )
-    estimate = Expectation(
-        moments=(),
-        key_data=np.asarray(jr.key_data(key)),
-        paths_per_sample=plan.paths_per_sample,
-        reason=plan.reason if start is None else start.reason,
-        tol_reached=None if tol is None else False,
-        **plan.outputs._asdict(),
-        **fields,
-    )
     kept = Kept() if kept is None else kept
+    tol_reached = None if tol is None else False
+    estimate = _first_estimate(plan, key, start, tol_reached=tol_reached, **fields)
     if start is not None:
-        check_same(start, estimate, "`start`")
-        if next_sample > end:
-            raise ValueError(
-                "The number of paths (or replicates) includes `start`, which has "
-                f"{next_sample - begin} already; got {plan.num_samples}. Pass a larger "
-                "number."
-            )
-        estimate = dataclasses.replace(estimate, moments=start.moments)
         kept.estimate = estimate
 
     def needs_no_more_samples() -> bool:
         """Whether there are enough samples for the tolerance, or more samples would not
         help, because the error of the steps or of failed paths is too large."""
+        # With fewer samples the error is too uncertain to stop. `None` is never to stop.
         least = plan.least_beside_steps if tol is None else plan.least_samples
         if least is None or estimate.num_samples < least:
             return False
@@ -109,6 +95,7 @@ def run(
         return is_reached(estimate, tol) or is_stuck(estimate, tol)
 
     batches = _Batches(plan, key, devices)
+    # The number of the first sample of each batch.
     firsts = iter(range(next_sample, end, batches.size * len(devices)))
 
     def start_batch() -> Callable[[], list[BatchMoments]] | None:
@@ -123,7 +110,8 @@ def run(
         # is added to the estimate.
         moments_ahead = start_batch()
         for device_moments in moments_of_batch():
-            # Samples are counted device by device, so that their number at the end does not
+            # If there are enough samples before the last device of a batch, those of the
+            # other devices are dropped, so that the number of samples at the end does not
             # depend on the number of devices.
             if next_sample == end or needs_no_more_samples():
                 break
@@ -145,12 +133,38 @@ def run(
     return estimate
 
 
+def _first_estimate(
+    plan: SamplingPlan, key: PRNGKeyArray, start: Expectation | None, **fields: Any
+) -> Expectation:
+    """The estimate before the first batch: it has the samples of `start`, or none. Raises a
+    `ValueError` if `start` has another key, other arguments, or more samples than the plan.
+    `fields` are further fields of the estimate."""
+    estimate = Expectation(
+        moments=() if start is None else start.moments,
+        key_data=np.asarray(jr.key_data(key)),
+        paths_per_sample=plan.paths_per_sample,
+        reason=plan.reason if start is None else start.reason,
+        **plan.outputs._asdict(),
+        **fields,
+    )
+    if start is not None:
+        check_same(start, estimate, "`start`")
+        num_taken = start.moments[-1].end - start.moments[0].begin
+        if num_taken > plan.num_samples:
+            raise ValueError(
+                "The number of paths (or replicates) includes `start`, which has "
+                f"{num_taken} already; got {plan.num_samples}. Pass a larger number."
+            )
+    return estimate
+
+
 class _Batches:
     """The batches of a plan, in each of which every device takes `size` samples.
 
-    Implicit steps are first solved by the sweeps of `PicardNewton` alone. Few paths need
-    its Newton's method, which would be a third of the time to compile a step. Once a path
-    fails, its batch is computed again with Newton's method, and so are all later batches.
+    Implicit steps are first solved by sweeps alone, the fixed-point iterations of the root
+    finder `PicardNewton`. Few paths need its Newton's method, which would be a third of the
+    time to compile a step. Once a path fails, its batch is computed again with Newton's
+    method, and all later batches are computed with it.
     """
 
     def __init__(self, plan: SamplingPlan, key: PRNGKeyArray, devices: Devices):
@@ -174,6 +188,7 @@ class _Batches:
         `end` on do not count. Returns a function that waits for the moments on each
         device."""
         num_devices = len(self._devices)
+        # The number in two halves of 32 bits, since JAX may have no 64-bit integers.
         low_high = np.array([first & 0xFFFFFFFF, first >> 32], np.uint32)
         num_wanted = np.array(min(self.size * num_devices, end - first), np.int32)
         if num_devices == 1:
@@ -201,6 +216,7 @@ class _Batches:
             check_untraced("`expectation` or `monte_carlo`", moments)
             on_host = jax.device_get(moments)
             if may_be_repeated and np.any(on_host.any_failed):
+                # Repeat this batch, and take all later ones, with Newton's method.
                 self._samplers = self._samplers[-1:]
                 return self.start(first, end)()
             return [
@@ -238,8 +254,8 @@ def _samples_of_paths(
 
 
 def _in_float64(device_moments: BatchMoments, begin: int, end: int) -> Moments:
-    """The moments of samples `begin` to `end - 1`, in float64."""
-    # Single precision could not hold the sum of a mean and its correction.
+    """The moments of samples `begin` to `end - 1`, which one device computed, in float64.
+    The mean is `mean + mean_correction`, a sum that single precision could not hold."""
     wide = jtu.tree_map(lambda x: x.astype(float), device_moments)
     return Moments(
         begin=begin,

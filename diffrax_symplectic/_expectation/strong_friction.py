@@ -1,7 +1,8 @@
 """Whether steps are too long for the friction of Langevin terms, in the state in which
 paths start.
 
-A rate of decay is compared with the length of a step by its product with `dt0`.
+A rate of decay is compared with the length of a step by its product with `dt0`. A number
+that is NaN gives no warning: each comparison with it is false.
 """
 
 import functools as ft
@@ -15,7 +16,6 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from .._brownian import zeros_and_unravel
 from .._compat import unwrapped
 from .._custom_types import Terms
 from .._programs import compiled, once_for_each_signature
@@ -26,17 +26,15 @@ from .._solver import (
     after_friction,
 )
 from .._terms import (
-    apply,
     BathNoise,
     constraint_of,
-    control_struct,
     Dependence,
     field_of,
     rate,
     split_friction,
     tree_sum,
 )
-from .fields_in_time import drift_rate
+from .fields_in_time import change_by_increments, drift_rate
 from .linear_maps import largest_growth, linearized
 from .long_steps import drift_frequencies
 
@@ -72,11 +70,16 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
     they do, or for solvers of other packages.
 
     Two levels need not show unresolved friction: momenta may be wrong by about the same
-    factor on both levels, and positions may rest on both."""
+    factor on both levels, and positions may rest on both. The first of these that applies
+    gives the warning:
+
+    - There are no terms of friction, but the drift damps the state too fast.
+    - The friction damps momenta too fast for the solver.
+    - The flow of a splitting turns a mode too far, for strong friction.
+    - The friction changes too much along a step."""
     solver = problem.solver
-    if not isinstance(solver, AbstractSymplecticSolver):
-        return None
-    if constraint_of(problem.terms) is not None:
+    is_own = isinstance(solver, AbstractSymplecticSolver)
+    if not is_own or constraint_of(problem.terms) is not None:
         return None
     drift, friction, noise = split_friction(problem.terms)
     if not noise:
@@ -91,6 +94,7 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
     may_change = _may_change(problem)
     if most_friction is None and not has_flow and not may_change:
         return None
+    # The rate takes a program to compile, so it is computed only if a check needs it.
     damping = float(_friction_rate(problem)) * dt0
     if most_friction is not None and damping > most_friction:
         return (
@@ -109,7 +113,7 @@ def unresolved_friction(problem: Problem, dt0: float) -> str | None:
 
 def _unresolved_decay(problem: Problem, dt0: float, most_friction: float) -> str | None:
     """A warning if the drift damps the state too fast for the solver, as the loss of a wave
-    does. `most_friction` is that of `Record`."""
+    does. `most_friction` is the largest rate times `dt0` that the solver takes."""
     decay = float(_decay(problem)) * dt0
     if not decay > most_friction:
         return None
@@ -174,39 +178,36 @@ def _friction_force(
 
 @ft.partial(compiled, quickly=True)
 def _change_along_step(problem: Problem) -> Float[Array, ""]:
-    """How much the friction changes along the first step because positions change, relative
-    to the friction where paths start. This is the change of the friction's force at the
-    same velocity, in the root mean square over a few thermal velocities."""
+    """How much the friction, with the force `-G(q) v`, changes along the first step because
+    positions change: the root mean square of `G(q1) v - G(q0) v`, divided by that of `G(q0)
+    v`, over a few thermal velocities `v`. The step takes `q0` to `q1 = q0 + dt0 v`."""
+    t0 = problem.t0
+    dt0 = problem.level(0).h
+    p0, q0 = problem.y0
     drift, friction, noise = split_friction(problem.terms)
     bath_noise = tuple(term for term in noise if isinstance(unwrapped(term), BathNoise))
-    p0, q0 = problem.y0
-    dt0 = problem.level(0).h
-    structs = [control_struct(term, problem.t0) for term in bath_noise]
-    zeros, unravel = zeros_and_unravel(structs)
+    noise_change, zeros = change_by_increments(bath_noise, problem.args, t0)
 
     def thermal_momentum(key: PRNGKeyArray) -> PyTree[Array]:
-        """A momentum with the law of the bath, by steps of the bath alone, which keep this
-        law whatever their length. The first steps are short, and draw the parts of the
-        momentum that decay fast. The last steps are long, and draw the parts that decay
-        slowly."""
+        """A momentum with the law of the heat bath. It is drawn by steps of the bath alone,
+        which keep this law whatever their length: of length `dt0`, `2 dt0`, `4 dt0` and so
+        on. The first steps are short, and draw the parts of the momentum that decay fast.
+        The last steps are long, and draw the parts that decay slowly."""
 
-        def step_of_bath(number: Array, p: PyTree[Array]) -> PyTree[Array]:
-            h = dt0 * 2.0**number
-            draws = jr.normal(jr.fold_in(key, number), zeros.shape, zeros.dtype)
-            increments = unravel(jnp.sqrt(h).astype(zeros.dtype) * draws)
+        def step_of_bath(doublings: Array, p: PyTree[Array]) -> PyTree[Array]:
+            h = dt0 * 2.0**doublings
+            draws = jr.normal(jr.fold_in(key, doublings), zeros.shape, zeros.dtype)
+            increments = jnp.sqrt(h).astype(zeros.dtype) * draws
             y = p, q0
-            noise_change, _ = apply(bath_noise, increments, problem.args, problem.t0, y)
-            return after_friction(
-                friction, problem.t0, h, y, problem.args, noise_change
-            )
+            momentum_change, _ = noise_change(y, increments)
+            return after_friction(friction, t0, h, y, problem.args, momentum_change)
 
         return lax.fori_loop(0, _DOUBLINGS, step_of_bath, p0)
 
     def squared_forces(key: PRNGKeyArray) -> tuple[Array, Array]:
-        """The squares of the friction's force at the start of the step, and of the change
-        of this force along the step."""
+        """The squares of `G(q0) v`, and of `G(q1) v - G(q0) v`."""
         p = thermal_momentum(key)
-        _, velocity = rate(drift, problem.t0, (p, q0), problem.args)
+        _, velocity = rate(drift, t0, (p, q0), problem.args)
         q1 = jtu.tree_map(lambda q, v: q + dt0 * v, q0, velocity)
         force = _friction_force(problem, friction, q0, velocity)
         force_after = _friction_force(problem, friction, q1, velocity)
@@ -219,7 +220,9 @@ def _change_along_step(problem: Problem) -> Float[Array, ""]:
 
 @ft.partial(compiled, quickly=True)
 def _friction_rate(problem: Problem) -> Float[Array, ""]:
-    """The largest rate at which friction damps a momentum where paths start."""
+    """The largest rate at which friction damps a momentum where paths start: minus the
+    largest eigenvalue, in size, of the derivative of its force by the momentum; zero if
+    this eigenvalue is positive."""
     _, friction, _ = split_friction(problem.terms)
     p0, q0 = problem.y0
 
@@ -229,14 +232,14 @@ def _friction_rate(problem: Problem) -> Float[Array, ""]:
     force_by_p, flat_p0 = linearized(force, problem.t0, p0)
     growth = largest_growth(force_by_p, flat_p0, _ITERATIONS)
     # Eigenvalues are real for symmetric masses and friction, and negative where friction
-    # damps.
+    # damps. Power iteration finds the one of largest size.
     return jnp.maximum(-growth.rayleigh_quotient, 0)
 
 
 @ft.partial(compiled, quickly=True)
 def _decay(problem: Problem) -> Float[Array, ""]:
     """The rate at which the drift damps the state, at `y0`, in the direction in which it
-    changes most; zero if the state grows or oscillates there."""
+    changes the state most; zero if the state grows or oscillates in this direction."""
     drift, _, _ = split_friction(problem.terms)
     field = jtu.Partial(drift_rate, drift, problem.args)
     derivative, flat_y0 = linearized(field, problem.t0, problem.y0)
@@ -246,7 +249,7 @@ def _decay(problem: Problem) -> Float[Array, ""]:
     # For a decay, the derivative turns the direction around, and applied twice turns it
     # back. For an oscillation, the derivative may also turn the direction around, if
     # positions and momenta differ much in size. But applied twice it multiplies by
-    # -omega^2, which does not turn the direction back.
+    # -omega^2, so the direction is not turned back.
     turns_around = _cosine(direction, once) < -_COSINE_OF_PARALLEL
     turns_back = _cosine(direction, twice) > _COSINE_OF_PARALLEL
     # Where the derivative is zero, cosines are NaN, and both comparisons false.

@@ -55,9 +55,10 @@ def warn_of_stragglers(
     if num_rescued > _LARGEST_SHARE_OF_STRAGGLERS * num_paths:
         warnings.warn(
             f"{num_stragglers:,} of {num_paths:,} paths had steps that the fused kernel "
-            "did not solve, or the sine or cosine of an angle beyond 2^31 (in single "
-            "precision 2^13), and were simulated again by JAX. Take smaller steps or "
-            'angles, or `engine="jax"`.',
+            "did not solve, or numbers that are too large for it: the sine or cosine of an "
+            "angle beyond 2^31, or a remainder of a quotient beyond 2^53 (in single "
+            "precision 2^13 and 2^24). They were simulated again by JAX. Take smaller "
+            'steps or numbers, or `engine="jax"`.',
             stacklevel=stacklevel + 1,
         )
 
