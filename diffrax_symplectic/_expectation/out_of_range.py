@@ -56,10 +56,10 @@ def _lost_arguments(problem: Problem) -> Iterator[str]:
             precision = jnp.finfo(jnp.result_type(leaf, problem.dtype))
             size = float(np.max(np.abs(_in_float64(leaf)), initial=0))
             # Numbers below `tiny` have fewer digits, and most processors take them for
-            # zero.
-            if 0 < size < precision.tiny:
+            # zero. (NumPy would convert `size` to single precision, with a warning.)
+            if 0 < size < float(precision.tiny):
                 yield f"`{name}` of {size:.2g} counts as zero"
-            if precision.max < size < np.inf:
+            if float(precision.max) < size < np.inf:
                 yield f"`{name}` of {size:.2g} counts as infinite"
 
 
