@@ -141,7 +141,7 @@ def _kicks_at_ends(problem: Problem, solver: AbstractLangevinSplitting) -> _AtEn
     # it first.
     terms, y0 = momentum_first(problem.terms, problem.y0)
     drift, _, _ = split_friction(without_constraint(terms))
-    kicks, _ = kicks_and_rest(solver.has_flow, drift)
+    kicks, _ = kicks_and_rest(has_flow=solver.has_flow, drift=drift)
     fields = {}
     # Splittings that are not symmetric have order 1.
     if kicks and solver.symmetric and solver.kicks_at_ends:

@@ -84,9 +84,10 @@ def run(
         kept.estimate = estimate
 
     def needs_no_more_samples() -> bool:
-        """Whether there are enough samples for the tolerance, or more samples would not
-        help, because the error of the steps or of failed paths is too large."""
-        # With fewer samples the error is too uncertain to stop. `None` is never to stop.
+        """Whether to stop. With a tolerance: once it is reached, or more samples would not
+        help, because the error of the steps or of failed paths is too large. Without one:
+        once the error of the steps is most of the error, if the plan allows that."""
+        # With fewer samples the error is too uncertain to stop.
         least = plan.least_beside_steps if tol is None else plan.least_samples
         if least is None or estimate.num_samples < least:
             return False

@@ -94,7 +94,8 @@ def drawn_variables(
     optional: Iterable[str] = (),
 ) -> dict[str, list]:
     """The random variables of the step from `t0` to `t1`: for each name, one value for
-    each noise term. The `optional` ones are left out unless all increments have them.
+    each noise term. The `optional` ones are left out unless all increments have them, and
+    where `W` is the only one needed.
 
     Raises a `ValueError`, which quotes `solver_name`, if a path lacks one of `names`.
     """

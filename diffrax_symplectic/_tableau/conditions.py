@@ -307,8 +307,9 @@ def _weak_conditions_separable(tableau: SeparableTableau) -> tuple[dict, dict]:
     """Random variables other than `W` are taken to be functions of `W`, as in the paper
     (Wang, Hong and Xu 2017, equations (3.3)-(3.5)): for example `(W^2 - h) / (2 sqrt(h))`.
     """
-    # The conditions for a `PartitionedTableau` are for independent variables. So here they
-    # are used for `W` alone.
+    # The conditions of a `PartitionedTableau` with sums over the variables in `B0` are for
+    # independent variables. So here they get `W` alone. The conditions on the weights of
+    # the other variables, `beta[name].e`, stay.
     only_W = {"W": tableau.B0["W"]}
     partitioned = dataclasses.replace(tableau.partitioned(), B0=only_W)
     first, second = _weak_conditions(partitioned)

@@ -178,11 +178,12 @@ def balanced_in_sixths(
     consecutive points: the smallest of a block becomes the first of all words, the largest
     the last one, and the other four the middle one.
     """
-    n, d = points.shape
+    n = len(points)
     if n < _BLOCK:
         return scrambled(points, seeds)
-    # The first point and its position in its block are random. So each point has the same
-    # law, and is the smallest of its block with probability 1/6.
+    # The first point and its position in its block are random, by the two seeds that
+    # `scrambled` leaves. So each point has the same law, and is the smallest of its block
+    # with probability 1/6.
     first_index, position = seeds[-2:]
     position_in_block = position % np.uint32(_BLOCK)
     # `n` points are in at most `n // 6 + 2` blocks, wherever in its block the first one is.
@@ -195,5 +196,5 @@ def balanced_in_sixths(
     is_smallest = blocks == jnp.min(blocks, axis=1, keepdims=True)
     is_largest = blocks == jnp.max(blocks, axis=1, keepdims=True)
     middle_or_last = jnp.where(is_largest, np.uint32(2**32 - 1), np.uint32(2**31))
-    balanced = jnp.where(is_smallest, np.uint32(0), middle_or_last).reshape(-1, d)
+    balanced = jnp.where(is_smallest, np.uint32(0), middle_or_last).reshape(-1, 1)
     return lax.dynamic_slice_in_dim(balanced, position_in_block.astype(jnp.int32), n)

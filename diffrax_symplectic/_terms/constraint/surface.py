@@ -215,17 +215,18 @@ class Surface(NamedTuple):
         return ~(position_is_on & momentum_is_tangent)
 
     def _size_by_curvature(self, normal_space: NormalSpace) -> Float[Array, " c"]:
-        r"""An estimate of the size of the terms that cancel in each constraint $g$, such as
-        one for $q^2 - 1$: the gradient times the radius of curvature,
-        $|g'| \cdot |g'| / |g''|$, with $g''$ along an arbitrary direction. It is zero for a
-        plane.
+        r"""An estimate of the size of the terms that cancel in each constraint $g$: the
+        gradient times the radius of curvature, $|g'| \cdot |g'| / |g''|$, with $g''$ along
+        an arbitrary direction. For $q^2 - 1 = 0$ it is $2 q^2 = 2$, for terms of size one.
+        It is zero for a plane.
 
-        It matters near the origin: there the positions are smaller than these terms, and so
-        are their rounding errors.
+        It matters near the origin. There the positions are smaller than these terms, and
+        the rounding errors of the positions are smaller than the terms' own.
         """
         q = normal_space.q
         # An arbitrary direction, which no symmetry of the constraint singles out.
         direction = jnp.cos(1.0 + jnp.arange(len(q), dtype=q.dtype))
+        # How the gradient of each constraint changes along it.
         _, gradient_changes = jax.jvp(jax.jacrev(self.residual), (q,), (direction,))
         # Sums over the positions, the last axis.
         curvatures = jnp.sum(jnp.abs(gradient_changes), axis=1)

@@ -185,17 +185,19 @@ def separable_fault(
     faults = faults_if(momenta=0)
     if len(faults) == 0:
         return None
-    only_friction = all(fault.friction for fault in faults)
-    wrong_way_round = False
-    if not only_friction:
-        faults_if_exchanged = faults_if(momenta=1)
-        # This is also true if there are no faults.
-        wrong_way_round = all(fault.friction for fault in faults_if_exchanged)
-        only_friction = wrong_way_round and len(faults_if_exchanged) > 0
     # Of several faults the first one is reported.
     cause = faults[0].cause
-    advice = f"{FRICTION} {faults[0].advice}" if only_friction else faults[0].advice
-    return Fault(cause, advice, friction=only_friction, wrong_way_round=wrong_way_round)
+    advice = faults[0].advice
+    advice_on_friction = f"{FRICTION} {advice}"
+    # The rows of the table, from the first to the last.
+    if all(fault.friction for fault in faults):
+        return Fault(cause, advice_on_friction, friction=True)
+    if_exchanged = faults_if(momenta=1)
+    if len(if_exchanged) == 0:
+        return Fault(cause, advice, wrong_way_round=True)
+    if all(fault.friction for fault in if_exchanged):
+        return Fault(cause, advice_on_friction, friction=True, wrong_way_round=True)
+    return Fault(cause, advice)
 
 
 def _drift_faults(traced_drift: _TracedTerms, momenta: int) -> list[Fault]:
