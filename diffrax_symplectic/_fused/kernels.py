@@ -2,6 +2,8 @@
 
 Kernels are recorded and compiled once for a system. The step size, the time, parameters and
 numbers of steps are inputs.
+
+Paths *differ* if each has its own initial state and arrays in `args`.
 """
 
 import dataclasses
@@ -38,7 +40,7 @@ class Lanes:
     the last is a list of one array for each entry.
 
     - `keys`: the random keys, as integers.
-    - `own_args`: the arrays in `args` that each path has of its own.
+    - `own_args`: the arrays in `args` if each path has its own, and otherwise nothing.
     - `y`: the states of the equation.
     - `solver_state`: the arrays in the solver state that differ between paths.
     - `stopped`: the mask of the paths of which a step was not solved.
@@ -52,13 +54,13 @@ class Lanes:
 
 
 class Kernels:
-    """The kernels of a system. Raises a `ValueError` if the state of the system is too
-    large."""
+    """The kernels of a system: one makes the random keys of paths, and one takes steps.
+    Raises a `ValueError` if the state of the system is too large."""
 
     def __init__(self, functions: PathFunctions):
         self._functions = functions
-        # Programs are lowered for shapes and dtypes of their arguments. The number of a
-        # path has 64 bits, in two integers.
+        # 1. Lower the functions to programs, for shapes and dtypes of their arguments. The
+        # number of a path has 64 bits, in two integers.
         uint32 = jax.ShapeDtypeStruct((), "uint32")
         arrays = functions.arrays
         key = functions.key
@@ -87,11 +89,11 @@ class Kernels:
             ),
         )
 
-        # An array of the solver state is *fixed* if paths start alike and a step returns
-        # the array unchanged: then all paths share it, and it needs no registers. Otherwise
-        # it is *moving*, and each path has its own.
-        def is_moving(number: int, returned: int) -> bool:
-            return functions.paths_differ or returned != number
+        # 2. Separate the solver state. An array in it is *fixed* if paths start alike and a
+        # step returns the same array that it got: then all paths share the array, and it
+        # needs no registers. Otherwise it is *moving*, and each path has its own.
+        def is_moving(argument_number: int, returned_number: int) -> bool:
+            return functions.paths_differ or returned_number != argument_number
 
         numbers = self._step.numbers["solver_state"]
         returned_numbers = self._step.returned.solver_state
@@ -100,13 +102,15 @@ class Kernels:
         self._types_of_moving, fixed = eqx.partition(
             types["solver_state"], self._is_moving
         )
-        # Types of the arrays that are packed: as inputs of the steps, and of the keys.
+        # 3. List the arrays that all paths share, which are packed into a few arrays of
+        # Dr.Jit: those that the steps read, and those that the keys are made from.
         self._types_of_shared = dict(arrays=types["arrays"], h=types["h"], fixed=fixed)
         types_of_key = self._path_keys.types["key"]
         self._types_for_keys = dict(arrays=types["arrays"], key=types_of_key)
+        # 4. Make functions that are compiled when they are first called: one by JAX, and
+        # two kernels. Dr.Jit calls the methods `_record...` only to record their
+        # operations: once for each combination of types and layouts of arguments.
         self._compiled_solver_state = jax.jit(self._solver_state_at_start)
-        # Dr.Jit calls these methods only to record their operations: once for each
-        # combination of types and layouts of arguments.
         frozen = ft.partial(dr.freeze, warn_after=_MOST_RECORDINGS)
         self._make_keys = frozen(self._record_keys)
         self._take_steps = frozen(self._record_steps)
@@ -123,8 +127,9 @@ class Kernels:
                 keys = self._functions.path_keys(arrays, key, jnp.zeros_like(low), low)
                 return self._functions.start(arrays, keys, own_args, y)
 
-            # No solver draws random numbers in `init`, so the state does not depend on the
-            # number of the path. With `out_axes=None`, JAX raises an error if it does.
+            # The start is computed for path number 0 alone: it does not depend on the
+            # number, since no solver draws random numbers in `init`. If one did, JAX would
+            # raise an error, for `out_axes=None` allows no result that depends on `low`.
             start = jax.vmap(start_of_path_number, out_axes=None)
             return start(jnp.zeros(1, "uint32"))
 
@@ -145,13 +150,13 @@ class Kernels:
         """The paths with the numbers `first_path` to `first_path + num_paths - 1` before
         their first step, and the packed inputs that all paths share in steps of size `h`.
         If paths differ, `y0` and `own_args` have a leading axis of paths."""
-        kinds = array_types()
+        dtypes = array_types()
         # The number of the first path is opaque, which means an input of the kernel. As a
         # constant it would make every batch compile another kernel, in 20 to 40 ms.
-        offset = dr.opaque(kinds["ui64"], first_path)
-        path_numbers = dr.arange(kinds["ui64"], num_paths) + offset
-        high = kinds["ui32"](path_numbers >> 32)
-        low = kinds["ui32"](path_numbers)
+        offset = dr.opaque(dtypes["ui64"], first_path)
+        path_numbers = dr.arange(dtypes["ui64"], num_paths) + offset
+        high = dtypes["ui32"](path_numbers >> 32)
+        low = dtypes["ui32"](path_numbers)
         packed_for_keys = pack(self._types_for_keys, dict(arrays=arrays, key=key))
         solver_state = self._compiled_solver_state(
             arrays, key, y0, jtu.tree_leaves(own_args)
@@ -163,7 +168,7 @@ class Kernels:
             own_args=self._in_lanes(types["own_args"], own_args, num_paths),
             y=self._in_lanes(types["y"], y0, num_paths),
             solver_state=self._in_lanes(self._types_of_moving, moving, num_paths),
-            stopped=dr.opaque(kinds["i1"], False, num_paths),
+            stopped=dr.opaque(dtypes["i1"], False, num_paths),
         )
         shared = dict(arrays=arrays, h=np.asarray(h), fixed=fixed)
         return lanes, pack(self._types_of_shared, shared)
@@ -184,8 +189,9 @@ class Kernels:
     def _in_lanes(
         self, types: PyTree, arrays: PyTree[Array], num_paths: int
     ) -> list[Any]:
-        """A Dr.Jit array for each entry of these arrays, with a lane for each path. If
-        paths differ, the arrays have a leading axis of paths."""
+        """A Dr.Jit array for each entry of these arrays of a path, with a lane for each
+        path. If paths differ, the arrays have a leading axis of paths. Otherwise all lanes
+        get the same values."""
         lanes = []
         leaves = zip(jtu.tree_leaves(types), jtu.tree_leaves(arrays), strict=True)
         for array_type, x in leaves:
@@ -214,11 +220,16 @@ class Kernels:
         lanes: Lanes,
     ) -> tuple[list[Any], list[Any], Any]:
         """Records the loop over the steps `first_step` to `end_step - 1`. Returns `y`,
-        `solver_state` and `stopped` of the `Lanes` after these steps. `constants` are the
-        large constants of a step: Dr.Jit asks for all that is in memory as arguments."""
+        `solver_state` and `stopped` of the `Lanes` after these steps.
+
+        - `packed`: the arrays that all paths share.
+        - `constants`: the large constants of a step, such as tables. They are arguments,
+            since Dr.Jit asks for all that a recorded function reads in memory.
+        """
         # Dr.Jit numbers its variables one after another, one for each operation. So the
-        # operations are counted by the difference to `last_variable` below. (The count is
-        # too large if many other variables are alive: Dr.Jit fills the gaps between these.)
+        # number of operations is about `last_variable - first_variable`. (The difference is
+        # too large if many other variables are alive, since Dr.Jit fills the gaps between
+        # their numbers.)
         first_variable = (first_step + 1).index
         types = self._step.types
         shared = unpack(self._types_of_shared, packed)
@@ -253,7 +264,7 @@ class Kernels:
             # largest number of sweeps in every later step.
             def kept_if_stopped(old: list[Any], new: PyTree[Tensor]) -> list[Any]:
                 new_entries = entries_of(jtu.tree_leaves(new))
-                return [dr.select(stopped, x, y) for x, y in zip(old, new_entries)]
+                return [dr.select(stopped, a, b) for a, b in zip(old, new_entries)]
 
             new_y = kept_if_stopped(y, stepped.y)
             new_moving = eqx.filter(stepped.solver_state, self._is_moving)

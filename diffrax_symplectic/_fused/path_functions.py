@@ -1,5 +1,9 @@
 """The functions of one path that kernels are made of, separated from the arrays that they
-read."""
+read. Kernels are compiled for the functions, and take the arrays as inputs.
+
+A *system* is a PyTree whose leaves are all that a kernel reads, with the fields `terms`,
+`y0` and `args` and the methods `with_args`, `init` and `step` of `_simulation.Problem`.
+"""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -32,11 +36,8 @@ class Stepped(NamedTuple):
 
 class PathFunctions(NamedTuple):
     """The functions of one path of a system, which take the arrays of the system as an
-    argument. Hashable: for equal `PathFunctions` kernels are compiled once.
-
-    A *system* is a PyTree whose leaves are all that a kernel reads, with the fields
-    `terms`, `y0` and `args` and the methods `with_args`, `init` and `step` of
-    `_simulation.Problem`.
+    argument. Hashable: compiled kernels are kept by their `PathFunctions`, and equal ones
+    have the same kernels.
 
     The methods have these arguments:
 
@@ -89,7 +90,7 @@ class PathFunctions(NamedTuple):
     ) -> PyTree[Array]:
         """The state of the solver before the first step of a path from `y`."""
         system, terms = self._system_and_terms(arrays, keys, own_args)
-        # No solver's initial state depends on the size of the first step.
+        # No solver's initial state depends on the size of the first step: any `h` serves.
         h = jnp.ones((), jnp.result_type(*jtu.tree_leaves(y)))
         return system.init(terms, 0, h, y)
 
@@ -133,26 +134,25 @@ def functions_and_arrays(
     paths_differ: bool,
 ) -> tuple[PathFunctions, list[Array]]:
     """Separates a system into the functions of one path, for which kernels are compiled,
-    and the arrays of the system, which the kernels read.
+    and the arrays of the system, which are inputs of the kernels.
 
-    `own_args` is an example of the arrays in the `args` of each path if `args` are drawn,
-    and otherwise `None`. `paths_differ` says whether each path has its own initial state
-    and `args`.
+    The functions must be hashable, since they are the key under which compiled kernels are
+    kept. So they hold only the shapes and dtypes of arrays, not the values.
+
+    - `key`: the random key from which those of the paths are derived.
+    - `own_args`: an example of the arrays in the `args` of a path if `args` are drawn for
+        each path, and otherwise `None`.
+    - `paths_differ`: whether each path has its own initial state and `args`.
+
+    Raises a `ValueError` if a key is of another random number generator than JAX's default.
     """
-    for x in [key, *jtu.tree_leaves(system)]:
-        is_array = isinstance(x, jax.Array)
-        is_key = is_array and jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
-        if is_key and not is_threefry(x):
-            raise ValueError(
-                '`engine="drjit"` has JAX\'s default generator of random numbers, '
-                f"threefry2x32; got a key of `{jr.key_impl(x)}`. Pass "
-                '`jax.random.key(seed)`, or `engine="jax"`.'
-            )
     # Arrays of NumPy are inputs of the kernel as well, so that a kernel serves for all
     # values of a parameter.
     arrays, static = eqx.partition(system, _is_array)
     array_leaves, arrays_treedef = jtu.tree_flatten(jtu.tree_map(jnp.asarray, arrays))
     static_leaves, static_treedef = jtu.tree_flatten(static)
+    for x in [key, *array_leaves]:
+        _check_generator(x)
     functions = PathFunctions(
         arrays=tuple(map(_struct, array_leaves)),
         arrays_treedef=arrays_treedef,
@@ -169,6 +169,17 @@ def functions_and_arrays(
 
 def _is_array(x: Any) -> bool:
     return isinstance(x, jax.Array | np.ndarray)
+
+
+def _check_generator(x: Array) -> None:
+    """Raises a `ValueError` if `x` is a key of another generator than JAX's default."""
+    is_key = jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+    if is_key and not is_threefry(x):
+        raise ValueError(
+            '`engine="drjit"` has JAX\'s default generator of random numbers, '
+            f"threefry2x32; got a key of `{jr.key_impl(x)}`. Pass "
+            '`jax.random.key(seed)`, or `engine="jax"`.'
+        )
 
 
 def _struct(x: Array) -> jax.ShapeDtypeStruct:

@@ -25,8 +25,9 @@ from .._stablehlo import (
 
 
 class Program:
-    """A function of arrays of one path, lowered to StableHLO. A program has a tensor in
-    place of each array, and so computes the function for many paths at once.
+    """A function of arrays of one path, lowered to StableHLO. In place of each array a
+    program takes a `Tensor`, which holds the array for many paths, each in a lane of its
+    own. So it computes the function for all paths at once.
 
     - `types`: the types of all argument arrays. It is a dictionary by the names of the
         arguments, and each item has the structure of the argument.
@@ -101,14 +102,15 @@ def pack(
 
 
 def unpack(types: PyTree[ArrayType], packed: dict[str, Any]) -> PyTree[Tensor]:
-    """The arrays that `pack` has packed, within a kernel."""
-    # For each kind, the number of entries of the arrays that are unpacked already.
-    num_before = dict.fromkeys(packed, 0)
+    """The arrays of these types that `pack` has packed, within a kernel."""
+    # For each kind, the number of entries of the arrays that are unpacked already, which is
+    # the address of the next entry.
+    next_address = dict.fromkeys(packed, 0)
 
     def unpacked(array_type: ArrayType) -> Tensor:
         kind = array_type.kind
-        addresses = num_before[kind] + np.arange(array_type.size)
-        num_before[kind] += array_type.size
+        addresses = next_address[kind] + np.arange(array_type.size)
+        next_address[kind] += array_type.size
         table = Table(packed[kind], addresses)
         # A small array is read here, before the loop over steps. An entry of a large array
         # is read where a step needs it.

@@ -1,6 +1,7 @@
 """The root finder of a fused step: sweeps for one path, without a fallback.
 
-A *sweep* is a Gauss--Seidel iteration over two halves of the unknowns, as described in
+A *sweep* is one iteration of Gauss--Seidel over two halves $p$ and $q$ of the unknowns: it
+computes $p$ from the old $q$, then $q$ from the new $p$. The same sweeps solve a step in
 `_root_finder/sweeps.py`. There all paths of a batch sweep together, and checks for
 convergence are rare since they cost much. Here each path ends by itself, and checks after
 every sweep. Sweeps are relaxed, and count as converged, under the same conditions as there.
@@ -57,7 +58,8 @@ class _SweepState(NamedTuple):
 
 
 class _Tolerance(NamedTuple):
-    """How large a correction of a path may be when its sweeps have converged.
+    """How large the last *correction*, the change of the unknowns by a sweep, may be when
+    sweeps have converged.
 
     - `weights`: for each leaf of a correction, the inverse of the tolerance.
     - `rounding`: the largest correction that may consist of rounding errors alone.
@@ -73,14 +75,15 @@ class _Tolerance(NamedTuple):
         converged. The correction before had the size `size_before`."""
         sizes = _sizes(correction)
         size = _largest([x * weight for x, weight in zip(sizes, self.weights)])
-        # The next correction is expected to be `size * ratio` with the last ratio, `size /
-        # size_before`. If corrections grow, the ratio says nothing, and counts as one. So
-        # the condition is `2^LOG2_MARGIN * size * min(ratio, 1) <= 1`. Here both sides are
-        # multiplied by `size_before`, since a division takes long.
+        # 1. Sweeps have converged if the next correction is expected to be small. It is
+        # expected to be `size * ratio` with the last ratio, `size / size_before`. If
+        # corrections grow, the ratio says nothing, and counts as one. So the condition is
+        # `2^LOG2_MARGIN * size * min(ratio, 1) <= 1`. Here both sides are multiplied by
+        # `size_before`, since a division takes long.
         ratio_times_size_before = jnp.where(size < size_before, size, size_before)
         is_next_small = 2.0**LOG2_MARGIN * size * ratio_times_size_before <= size_before
-        # Corrections that consist of rounding errors do not shrink any further. They count
-        # as converged, too.
+        # 2. They have also converged if corrections consist of rounding errors, so that
+        # they do not shrink any further.
         is_stalled = size >= 2.0**LOG2_STALLED * size_before
         is_rounding = _largest(sizes) <= self.rounding
         return size, is_next_small | (is_stalled & is_rounding)
@@ -92,29 +95,32 @@ def solve_one_path(
     r"""Solves $y = \Phi(y)$ from a `guess`, where $\Phi$ is the `image`. Returns the last
     iterate, and whether it is a solution. A path that is not `pending` counts as solved.
 
+    1. Three sweeps make an iterate and two corrections.
+    2. If the ratio of these corrections shows slow convergence, further sweeps are relaxed.
+    3. Sweeps follow until they have converged or diverged, or are too many.
+
     `scale` maps an iterate to the sizes to which errors are relative. The arguments are
     those that [`diffrax_symplectic.PicardNewton`][] is called with.
 
-    Unless the unknowns are `Halves`, the equations are doubled, to $y = \Phi(z)$, $z =
-    \Phi(y)$, with the halves $y$ and $z$. These equations also hold for a cycle of period
-    two, in which $y \neq z$. So they are solved only when $y = z$.
+    Unless the unknowns are `Halves`, the equations are doubled, to $p = \Phi(q)$ and $q =
+    \Phi(p)$, with the halves $p$ and $q$. These equations also hold for a cycle of period
+    two, in which $p \neq q$. So they are solved only when $p = q$.
     """
     in_halves = isinstance(guess, Halves)
     dtype = jnp.result_type(*jtu.tree_leaves(guess))
     eps = jnp.finfo(dtype).eps
     one = jnp.ones((), dtype)
 
-    # In a sweep the half $q$ reads the new half $p$. For doubled equations, the image of
-    # each half is the new value of the other.
     def sweep(y: Halves, relaxation: Scalar | None = None) -> Halves:
+        """Computes $p$ from $q$, then $q$ from the new $p$."""
         unrelaxed_p = image(y).p if in_halves else image(y.q)
         y = Halves(_relaxed(unrelaxed_p, y.p, relaxation), y.q)
         unrelaxed_q = image(y).q if in_halves else image(y.p)
         return Halves(y.p, _relaxed(unrelaxed_q, y.q, relaxation))
 
-    # For doubled equations the correction is the difference of the two halves, since only
-    # equal halves are a solution.
     def correction(old: Halves, new: Halves) -> PyTree[Array]:
+        """The change by a sweep. For doubled equations it is the difference of the two
+        halves, since only equal halves are a solution."""
         return (new**ω - old**ω).ω if in_halves else (new.q**ω - new.p**ω).ω
 
     first = sweep(guess if in_halves else Halves(guess, guess))
@@ -133,8 +139,8 @@ def solve_one_path(
     size_before, _ = tolerance.check(correction(first, second), size_before=one)
     size, is_solved = tolerance.check(correction(second, third), size_before)
     # The relaxation is chosen once: later rates are those of relaxed sweeps, to which its
-    # formula does not apply. It is chosen in a branch, since few paths need it, and the
-    # division takes as long as a sweep.
+    # formula does not apply. A relaxation of one changes nothing. The formula stands in a
+    # branch, since few paths need it, and its division takes as long as a sweep.
     relaxation = lax.cond(
         size > SLOW * size_before,
         lambda: best_relaxation(jnp.minimum(size / size_before, _LARGEST_RATE)),
@@ -155,10 +161,10 @@ def solve_one_path(
     num_sweeps = jnp.full((), 3, jnp.int32)
     state = _SweepState(third, size, counts_as_solved, num_sweeps)
     end = lax.while_loop(goes_on, sweep_again, state)
-    # The halves of doubled equations differ by the last correction, which may be larger
-    # than the tolerance, since convergence is decided by the expected next correction. So
-    # one more image is taken: with it, paths of a field with jumps were off by 0.7 units in
-    # the last place, and without it by 49.
+    # For doubled equations one more image is taken, as half a sweep: the halves differ by
+    # the last correction, which may be larger than the tolerance, since convergence is
+    # decided by the expected next correction. With this image, paths of a field with jumps
+    # were off by 0.7 units in the last place, and without it by 49.
     return end.y if in_halves else image(end.y.q), end.is_solved
 
 
@@ -171,20 +177,21 @@ def _relaxed(new: PyTree, old: PyTree, relaxation: Scalar | None) -> PyTree[Arra
 
 
 def _rough_inverse(x: Scalar) -> Scalar:
-    """The inverse of a positive finite number up to a factor of two, from its exponent: a
-    division takes as long as a sweep.
+    """The inverse of a positive finite number `x`, up to a factor of two: `2^-k` for
+    `2^k <= x < 2^(k + 1)`. It is found from the bits of `x`, since a division takes as long
+    as a sweep.
 
     The inverse of zero is a large finite number. A number that is not finite gives minus
     infinity, and the check at the end of the step finds that the step failed.
     """
     info = jnp.finfo(x.dtype)
     integer = jnp.dtype(f"int{info.bits}")
-    # Read as an integer, the bits of a float are its exponent, followed by its mantissa.
-    # Shifts there and back set the mantissa to zero: a power of two is left.
+    # Read as an integer, the bits of a float are its exponent, followed by the `nmant` bits
+    # of its mantissa. Shifts there and back set the mantissa to zero: `2^k` is left.
     bits_of_one = int(np.asarray(1, x.dtype).view(integer))
     bits_of_power = lax.bitcast_convert_type(x, integer) >> info.nmant << info.nmant
-    # The exponent of 2^k is stored as `k + offset`, and thus that of one as the offset. So
-    # twice the bits of one minus those of 2^k are those of 2^-k.
+    # The exponent of 2^k is stored as `k + offset`, that of 1 as `offset`, and that of 2^-k
+    # as `2 offset - (k + offset)`.
     inverse = jnp.asarray(2 * bits_of_one, integer) - bits_of_power
     return lax.bitcast_convert_type(inverse, x.dtype)
 
@@ -204,9 +211,9 @@ def _largest(numbers: list[Scalar]) -> Scalar:
 
 
 class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
-    """Solves the stage equations by sweeps, and fails if they do not converge. `init` makes
-    all sweeps, and Optimistix makes no step. The state is the last iterate, and whether it
-    is a solution."""
+    """Solves the stage equations by sweeps, and fails if sweeps do not converge. `init`
+    makes all sweeps, and Optimistix makes no step. The state of the root finder is what
+    `solve_one_path` returns: the last iterate, and whether it is a solution."""
 
     rtol: float = 0.0
     atol: float = 0.0
@@ -214,8 +221,9 @@ class Sweeps(optx.AbstractRootFinder[PyTree[Array], PyTree[Array], Any, Any]):
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         del fn, f_struct, aux_struct, tags
-        # The guess `y` is zero, or NaN for a path that failed before. Constant zeros in its
-        # place need no registers.
+        # The stages are solved block by block, where the equations of a block do not depend
+        # on later ones. The guess `y` is zero, or NaN for a path that failed before.
+        # Constant zeros in its place need no registers.
         zeros = jtu.tree_map(jnp.zeros_like, y)
         return options["solve_blocks"](args, solve_one_path, zeros, all_finite(y))
 
@@ -239,11 +247,11 @@ def by_sweeps_alone(solver: Any) -> Any:
     which do not fall back to Newton's method. Raises a `ValueError` unless the tolerance is
     the default, rounding error."""
 
-    def with_sweeps(implicit: Any) -> Any:
-        # The other fields are not compared. JAX observes them when it simulates the paths
-        # that are not solved here.
+    def with_sweeps(implicit_solver: Any) -> Any:
+        # The other fields of `PicardNewton` may have any value. JAX uses them when it
+        # simulates the paths that are not solved here.
         for name in ("rtol", "atol", "norm"):
-            value = getattr(implicit.root_finder, name)
+            value = getattr(implicit_solver.root_finder, name)
             if value != getattr(PicardNewton(), name):
                 raise ValueError(
                     '`engine="drjit"` solves each step to rounding error; got '
@@ -253,7 +261,7 @@ def by_sweeps_alone(solver: Any) -> Any:
         # `Sweeps` solves the equations in `init`, so no steps are needed.
         return eqx.tree_at(
             lambda x: (x.root_finder, x.root_find_max_steps),
-            implicit,
+            implicit_solver,
             (Sweeps(), 0),
         )
 

@@ -14,7 +14,8 @@ from .elementwise import elementwise, is_zero
 
 
 def _divide(a, b):
-    """`a / b = a conj(b) / |b|^2`, scaled so that no square overflows."""
+    """`a / b`, as `a conj(s b) s / |s b|^2` with a scale `s` by which no square
+    overflows."""
     if is_zero(b.imag):
         # Many Hamiltonians divide by a real number.
         inverse = 1 / b.real
@@ -31,7 +32,7 @@ def _divide(a, b):
 
 
 def _sign(a):
-    """The number divided by its absolute value."""
+    """The number divided by its absolute value, or zero for zero."""
     size = dr.abs(a)
     inverse = dr.select(size == 0, 0, 1 / size)
     return type(a)(a.real * inverse, a.imag * inverse)

@@ -39,14 +39,9 @@ def _sharding_constraint(operation: Operation, x: Tensor) -> list[Tensor]:
     return [x]
 
 
-def _raises(region: Any) -> bool:
-    """Whether a region calls back to Python, as it does for `equinox.error_if`."""
-    calls = [op for op in operations_in(region) if "custom_call" in op.name]
-    return any("callback" in call_target(op) for op in calls)
-
-
 @rule
 def _case(operation: Operation, index: Tensor) -> list[Tensor]:
+    """Runs the region with the number `index`, which may differ between lanes."""
     regions = operation.mlir_op.regions
     last = len(regions) - 1
     value = known_value(index)
@@ -66,8 +61,16 @@ def _case(operation: Operation, index: Tensor) -> list[Tensor]:
     return tensors_from(_run_selected(operation, masks), operation.shapes)
 
 
+def _raises(region: Any) -> bool:
+    """Whether a region calls back to Python, as it does for `equinox.error_if`."""
+    calls = [op for op in operations_in(region) if "custom_call" in op.name]
+    return any("callback" in call_target(op) for op in calls)
+
+
 @rule
 def _if(operation: Operation, condition: Tensor) -> list[Tensor]:
+    """Runs the first of two regions in the lanes where the condition is true, and the
+    second in the remaining lanes."""
     value = known_value(condition)
     if value is not None:
         return operation.run(_IF_TRUE if value else _IF_FALSE, [])
@@ -79,10 +82,18 @@ def _if(operation: Operation, condition: Tensor) -> list[Tensor]:
 
 
 def _run_selected(operation: Operation, masks: dict[int, Any]) -> tuple[Any, ...]:
-    """Runs one of several regions in each lane, by nested conditionals of the kernel, and
-    returns the entries of its results. `masks` maps the number of each region to a mask. A
-    lane runs the first region whose mask is true, or the last region if no mask is true.
-    Lanes that fail in the region that they run are marked as failed."""
+    """Runs one of several regions in each lane, and returns the entries of its results.
+    `masks` maps the number of each region to the mask of the lanes that select it:
+
+        if masks[first]: run the first region
+        elif masks[second]: run the second region
+        ...
+        else: run the last region
+
+    The last mask is not read: a lane without a true mask runs the last region, too. Lanes
+    that fail in the region that they run are marked as failed. (Regions of conditionals
+    have no arguments. They read variables from outside.)
+    """
     (region, is_selected), *others = masks.items()
 
     def run_region() -> tuple[Any, ...]:
@@ -114,28 +125,33 @@ _MOST_UNROLLED_OF_INDICES = 32
 
 
 @rule
-def _while(operation: Operation, *xs: Tensor) -> list[Tensor]:
-    changing = _numbers_of_changing(operation)
-    changing_entries = entries_of([xs[k] for k in changing])
+def _while(operation: Operation, *start: Tensor) -> list[Tensor]:
+    """A loop over a state, a list of arrays which is `start` at first. As long as the
+    condition holds for the state, the body maps it to the next state.
+
+    The first iterations are unrolled: as many as have a known condition, up to a limit. All
+    iterations after them are a loop of the kernel.
+    """
+    changing = _indices_of_changing_arrays(operation)
+    changing_entries = entries_of([start[k] for k in changing])
     has_only_indices = not any(map(dr.is_float_v, changing_entries))
     max_unrolled = _MOST_UNROLLED_OF_INDICES if has_only_indices else _MOST_UNROLLED
-    state = [*xs]
-    # Iterations are unrolled as long as the condition is known, up to this number. The
-    # remaining ones are a loop of the kernel.
+    state = [*start]
     for _ in range(max_unrolled):
         (condition,) = operation.run(_CONDITION, state)
         is_met = known_value(condition)
         if is_met is None:
             break
+        # The loop ends within the unrolled iterations.
         if not is_met:
             return state
         state = operation.run(_BODY, state)
     return _loop(operation, state, changing)
 
 
-def _numbers_of_changing(operation: Operation) -> list[int]:
-    """The state of a loop is a list of arrays, which the body maps to a new list. Returns
-    the numbers of those arrays that the body does not return unchanged."""
+def _indices_of_changing_arrays(operation: Operation) -> list[int]:
+    """The indices, in the state of a loop, of the arrays that its body may change: all but
+    those that the body returns as they are."""
     body = block_of(operation.mlir_op, _BODY)
     *_, returns = body.operations
     old_and_new = zip(body.arguments, returns.operands)
@@ -145,27 +161,30 @@ def _numbers_of_changing(operation: Operation) -> list[int]:
 def _loop(
     operation: Operation, start: list[Tensor], changing: list[int]
 ) -> list[Tensor]:
-    """The state at the end of a loop of the kernel that begins with the state `start`.
-    `changing` is what `_numbers_of_changing` returns."""
-    # The state of Dr.Jit's loop consists of the entries of these arrays alone, so that
-    # constants among the other arrays stay known.
-    variables = [start[k] for k in changing]
+    """The state at the end of a loop of the kernel that begins with the state `start`. The
+    body changes only the arrays with the indices `changing`.
+
+    The state of Dr.Jit's loop is not the whole state:
+
+    - It has no arrays that do not change, so that constants among them stay known.
+    - It begins with `failed`, the mask of the lanes that have failed so far, since Dr.Jit's
+        loop returns its state and nothing else.
+    """
+    changing_arrays = [start[k] for k in changing]
 
     def whole_state(entries: Iterable[Any]) -> list[Tensor]:
         """The state in which the changing arrays have these entries."""
         state = [*start]
-        new = tensors_from(entries, [x.shape for x in variables])
-        for k, x in zip(changing, new):
+        new_arrays = tensors_from(entries, [x.shape for x in changing_arrays])
+        for k, x in zip(changing, new_arrays):
             state[k] = x
         return state
 
-    # Dr.Jit's loop returns its state and nothing else. So the mask of the lanes that have
-    # failed is a part of the state, the first one.
     def goes_on(failed: Any, *entries: Any) -> Any:
         (condition,), fails_now = operation.with_failures(
             lambda: operation.run(_CONDITION, whole_state(entries))
         )
-        # Without the mask, the loop might never end for a lane that failed.
+        # A lane that failed leaves the loop: its condition might hold forever.
         return condition.item() & ~(failed | fails_now)
 
     def iterate(failed: Any, *entries: Any) -> tuple[Any, ...]:
@@ -177,7 +196,7 @@ def _loop(
     # If no lane can fail, the mask stays constant, and Dr.Jit leaves it out.
     no_lane = array_types()["i1"](False)
     results = dr.while_loop(
-        state=(no_lane, *entries_of(variables)),
+        state=(no_lane, *entries_of(changing_arrays)),
         cond=goes_on,
         body=iterate,
         mode="symbolic",
@@ -185,7 +204,7 @@ def _loop(
     failed, *entries = map(usable_outside, results)
     operation.fail(failed)
     state_at_end = whole_state(entries)
-    # A lane that fails in the last evaluation of the condition leaves the loop without a
-    # mark in the state. The condition is recorded once more, only to mark these lanes.
+    # If a lane fails while the condition is evaluated, `goes_on` ends its loop, but cannot
+    # change `failed`. So the condition is evaluated once more, only to mark such lanes.
     operation.run(_CONDITION, state_at_end)
     return state_at_end

@@ -51,7 +51,7 @@ def _multiply(a, b):
         return a & b
     if dr.is_float_v(a):
         # Dr.Jit replaces each product with a constant zero by zero, although the product of
-        # zero and infinity, or zero and NaN, is NaN.
+        # zero and infinity, or zero and NaN, is NaN. (It is right for two constants.)
         if is_zero(a) and not is_literal(b):
             return _times_zero(b, a)
         if is_zero(b) and not is_literal(a):
@@ -105,11 +105,13 @@ def _remainder(a, b):
 
 
 def _remainder_of_floats(a, b):
+    """`|a| - trunc(|a| / |b|) |b|`, with the sign of `a`. It is NaN if `b` is zero or `a`
+    infinite. (Lanes with a very large quotient fail, by a limit in `operations.py`.)"""
     size = dr.abs(a)
     divisor = dr.abs(b)
     nearly_rest = dr.fma(-dr.trunc(size / divisor), divisor, size)
-    # Where rounding has moved the quotient to the next whole number, `nearly_rest` is off
-    # by one divisor.
+    # The rest lies in [0, divisor). Where rounding has moved the quotient to the next whole
+    # number, `nearly_rest` is off by one divisor.
     is_negative = nearly_rest < 0
     one_more = nearly_rest + divisor
     at_most_one_less = dr.select(
@@ -141,7 +143,8 @@ def _power(base, exponent):
 
 
 def _power_by_logarithm(base, exponent):
-    """`base**exponent` for any real exponent."""
+    """`base**exponent` for any real exponent: `exp(exponent log|base|)`, with the sign or
+    the special value that follows from the two numbers."""
     dtype = type(base)
     power_of_size = dr.exp(dr.log(dr.abs(base)) * exponent)
     # A negative number has real powers for whole exponents only. For odd exponents the
@@ -153,9 +156,8 @@ def _power_by_logarithm(base, exponent):
     negative_to_fraction = dr.select(dr.isinf(base), power_of_size, dtype(np.nan))
     power_of_negative = dr.select(is_whole, negative_to_whole, negative_to_fraction)
     by_logarithm = dr.select(base < 0, power_of_negative, power_of_size)
-    # The product of logarithm and exponent may be NaN in special cases, as infinity times
-    # zero. In these cases the power is 0 for a base of zero, and 1 for a base of one or an
-    # exponent of zero.
+    # In these special cases the result so far may be NaN. For example, in `0**0` the
+    # product of logarithm and exponent is infinity times zero.
     power = dr.select((base == 0) & (exponent > 0), dtype(0), by_logarithm)
     return dr.select((exponent == 0) | (base == 1), dtype(1), power)
 
@@ -201,9 +203,10 @@ def _atan2(y, x):
     # Two infinities have the slope 1, as in JAX. Their quotient would be NaN.
     slope = dr.select(shorter == longer, dtype(1), shorter / longer)
     in_eighth = dr.asin(slope / dr.sqrt(1 + slope * slope))
-    # By symmetry, the angle is found in a quarter of the circle, a half, and all of it.
+    # By symmetry, the angle of (|x|, |y|), which lies in a quarter of the circle, follows.
+    # Then that of (x, |y|), which lies in a half, and that of (x, y).
     in_quarter = dr.select(steep, np.pi / 2 - in_eighth, in_eighth)
-    # Two zeros have been given the slope 1, too, but their angle is 0.
+    # Two zeros have been given the slope 1, too, but the angle of (0, 0) is 0.
     in_quarter_or_zero = dr.select(y == 0, dtype(0), in_quarter)
     # The sign of `x` counts also if `x` is zero: the angle of (-0, 0) is pi.
     is_left = dr.copysign(dtype(1), x) < 0
@@ -216,20 +219,21 @@ def _erf(a):
 
 
 def _erfc(a):
-    r"""The complementary error function: for $x = |a|$ as $e^{-x^2} g(x) / (1 + 2 x)$, with
-    a polynomial for $g$. (For large $a$, the difference `1 - erf(a)` would have no correct
-    digits.)"""
+    r"""The complementary error function. For $x = |a|$ it is $e^{-x^2} g(x) / (1 + 2 x)$,
+    with a polynomial for $g$, and for negative $a$ it is $2$ minus its value at $x$. (For
+    large $a$, the difference `1 - erf(a)` would have no correct digits.)"""
     dtype = type(a)
-    # The size is bounded, since for infinity the quotient in the next line would be NaN.
+    # The size $x$ is bounded, since for infinity the next quotient would be NaN.
     size = _minimum(dr.abs(a), dtype(_ERFC_END))
     variable = (size - _ERFC_MIDDLE) / (size + _ERFC_MIDDLE)
+    # Horner's scheme, from the highest power down.
     g = dtype(0)
     for coefficient in reversed(_erfc_coefficients(_ERFC_DEGREES[dr.itemsize_v(a)])):
         g = dr.fma(g, variable, coefficient)
-    # The rounding error of `size^2` becomes a relative error of the exponential: for a size
-    # of 26 it may be half a unit in the last place of 676, which is 256 units of 1. So the
-    # exponential is corrected: `size^2 = square + rounded_off`, so that `exp(-size^2)` is
-    # `exp(-square) (1 - rounded_off)`.
+    # With `size^2 = square + rounded_off`, to rounding error `exp(-size^2)` is
+    # `exp(-square) (1 - rounded_off)`. Without this correction, the rounding error of the
+    # square becomes a relative error of the exponential: for a size of 26 it may be half a
+    # unit in the last place of 676, which is 256 units in the last place of 1.
     square = size * size
     rounded_off = dr.fma(size, size, -square)
     tail = dr.exp(-square) * (1 - rounded_off) * g / (1 + 2 * size)
@@ -247,18 +251,22 @@ def _erfc_coefficients(degree: int) -> list[float]:
     from scipy.fft import dct
     from scipy.special import erfcx
 
-    # Interpolation at Chebyshev's nodes. With this many nodes, the coefficients that are
-    # kept have rounding errors only. (NumPy's `chebinterpolate` has larger ones.)
+    # 1. Interpolate the function at Chebyshev's nodes, cosines of equidistant angles. With
+    # this many nodes, the coefficients that are kept have rounding errors only. (NumPy's
+    # `chebinterpolate` has larger ones.)
     num_nodes = 64
     angles = (np.arange(num_nodes) + 0.5) * np.pi / num_nodes
-    # The points `x` at which the variable is the cosine of these angles.
+    # The variable is `cos(angle)` at `x = middle (1 + cos) / (1 - cos)`, which is the same
+    # as `middle / tan(angle / 2)^2`.
     x = _ERFC_MIDDLE / np.tan(angles / 2) ** 2
-    # `erfcx(x)` is `exp(x^2) erfc(x)`. Chebyshev's polynomial of degree n is the cosine of
-    # `n angle`, so that a cosine transform gives the coefficients, the first one doubled.
+    # 2. Chebyshev's polynomial of degree n is the cosine of `n angle`, so that a cosine
+    # transform gives the coefficients, the first one doubled. (`erfcx(x)` is
+    # `exp(x^2) erfc(x)`.)
     series = np.asarray(dct((1 + 2 * x) * erfcx(x))) / num_nodes
     series[0] /= 2
-    # The sum over powers takes half the operations of a sum over Chebyshev's polynomials.
-    # Its rounding errors are as small, since the coefficients decrease fast.
+    # 3. Convert to powers of the variable: a sum over powers takes half the operations of a
+    # sum over Chebyshev's polynomials. Its rounding errors are as small, since the
+    # coefficients decrease fast.
     return cheb2poly(series[: degree + 1]).tolist()
 
 
@@ -271,32 +279,36 @@ def _rsqrt(a):
 
 
 def _half_exp(a):
-    """Half of the exponential, for a number whose exponential overflows."""
-    # The rounding error of the root counts twice. So this function is used for such numbers
-    # only.
+    """`exp(a) / 2` for an `a` at which `exp(a)` overflows, but its half may be finite."""
+    # The rounding error of the root counts twice. So this function is not used for smaller
+    # numbers.
     root = dr.exp(a / 2)
     return root / 2 * root
 
 
 def _sinh(a):
-    size = dr.abs(a)
-    expm1 = _expm1(size)
-    overflows = dr.isinf(expm1)
-    after_overflow = _half_exp(size)
-    # With `e` for `expm1`, exp(x) is e + 1 and exp(-x) is 1 - e / (e + 1). Where the
-    # exponential overflows, the quotient is NaN.
-    difference = expm1 + expm1 / (expm1 + 1)
-    value = dr.select(overflows, after_overflow, difference / 2)
+    """`sinh(x) = (exp(x) - exp(-x)) / 2` for `x = |a|`, with the sign of `a`. It is
+    computed as `(e + e / (e + 1)) / 2` from `e = exp(x) - 1`, which keeps its digits near
+    zero: `exp(x)` is `1 + e`, and `exp(-x)` is `1 - e / (e + 1)`."""
+    x = dr.abs(a)
+    e = _expm1(x)
+    # Where the exponential overflows, the quotient is NaN, but `sinh(x)` may be finite.
+    overflows = dr.isinf(e)
+    after_overflow = _half_exp(x)
+    value = dr.select(overflows, after_overflow, (e + e / (e + 1)) / 2)
     return dr.copysign(value, a)
 
 
 def _cosh(a):
+    """`(exp(x) + exp(-x)) / 2` for `x = |a|`."""
     size = dr.abs(a)
     exp = dr.exp(size)
     return dr.select(dr.isinf(exp), _half_exp(size), exp / 2 + 0.5 / exp)
 
 
 def _tanh(a):
+    """`tanh(x) = (1 - exp(-2 x)) / (1 + exp(-2 x))` for `x = |a|`, with the sign of `a`. It
+    is computed as `-e / (e + 2)` from `e = exp(-2 x) - 1`."""
     # On CPUs Dr.Jit's own `tanh` is as accurate, but gives 0 for -0, and in single
     # precision its values at -1 and 1 differ in size. The argument of `_expm1` is negative,
     # so that the exponential does not overflow.
@@ -305,6 +317,7 @@ def _tanh(a):
 
 
 def _atanh(a):
+    """`(log(1 + a) - log(1 - a)) / 2`."""
     # On CPUs Dr.Jit's own `atanh` is right to 1.2 units in the last place, and this formula
     # to 2. On GPUs Dr.Jit's own has not been measured, and this formula passes the tests.
     return (_log1p(a) - _log1p(-a)) / 2
@@ -315,16 +328,17 @@ def _logistic(a):
 
 
 def _erf_inv(a):
-    """The inverse of the error function. In double precision Dr.Jit's own is right to at
-    most the digits of single precision. Two steps of Halley's method follow, each of which
-    triples the number of correct digits."""
+    """The inverse of the error function. Dr.Jit's own is right to at most the digits of
+    single precision. So in double precision two steps of Halley's method follow, each of
+    which triples the number of correct digits."""
     start = dr.erfinv(a)
     if dr.itemsize_v(a) < 8:
         return start
     y = start
     for _ in range(2):
-        # For `f(y) = erf(y) - a`, Newton's step is `f / f'`. Halley's method divides it by
-        # `1 - (f / f') f'' / (2 f')`, and `f'' / f'` is `-2 y`.
+        # The equation is `f(y) = erf(y) - a = 0`, with `f' = 2 / sqrt(pi) exp(-y^2)` and
+        # `f'' = -2 y f'`. Newton's step is `n = f / f'`. Halley's method divides it by
+        # `1 - n f'' / (2 f')`, which is `1 + n y`.
         newton_step = (dr.erf(y) - a) * (np.sqrt(np.pi) / 2) * dr.exp(y * y)
         y = y - newton_step / (1 + y * newton_step)
     # At -1 and 1 the inverse is infinite, and beyond them NaN. There `start` is right.

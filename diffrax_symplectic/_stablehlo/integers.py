@@ -8,16 +8,16 @@ from .backend import array_types, dr
 
 
 def safe_divisor(a, b):
-    """The integer `b`, or 1 where a processor would trap on the quotient `a / b`:
+    """The integer `b`, or 1 where a processor would abort the program at `a / b`:
 
     - `b` is zero, or
     - `b` is -1 and `a` the smallest integer, so that the quotient is too large.
     """
-    traps = b == 0
+    aborts = b == 0
     if dr.is_signed_v(b):
         smallest = type(a)(-(2 ** (8 * dr.itemsize_v(a) - 1)))
-        traps = traps | ((b == -1) & (a == smallest))
-    return dr.select(traps, type(b)(1), b)
+        aborts = aborts | ((b == -1) & (a == smallest))
+    return dr.select(aborts, type(b)(1), b)
 
 
 # Shifts by a number of bits. In StableHLO the operation decides whether a shift to the
@@ -67,13 +67,13 @@ def to_integer(dtype: type, a: Any) -> Any:
     # The first integer above the range, a power of two, and the largest float below it.
     end = 2 ** (bits - 1 if is_signed else bits)
     float_below_end = float(np.nextafter(end, 0, dtype=f"f{dr.itemsize_v(a)}"))
-    least = -end if is_signed else 0
+    smallest = -end if is_signed else 0
     below_end = dr.select(a < end, a, float_dtype(float_below_end))
-    in_range = dr.select(a > least, below_end, float_dtype(least))
+    in_range = dr.select(a > smallest, below_end, float_dtype(smallest))
     # Dr.Jit has no conversion to integers of eight bits.
     integer = dtype(array_types()["i32"](in_range)) if bits < 32 else dtype(in_range)
-    # The largest integer may lie between two floats. So far numbers above the range have
-    # then become the lower one of these floats.
+    # Numbers above the range have become `float_below_end`. For many types this is not the
+    # largest integer, which no float of this type equals.
     if int(float_below_end) < end - 1:
         integer = dr.select(a < end, integer, dtype(end - 1))
     return dr.select(dr.isnan(a), dtype(0), integer)

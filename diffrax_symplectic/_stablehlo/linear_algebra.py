@@ -24,9 +24,12 @@ Matrix: TypeAlias = list[list[Any]]
 
 
 def _lu(a: Matrix) -> tuple[Matrix, list[Any]]:
-    """The factors of `P A = L U` in one matrix, as LAPACK's `getrf` returns them, and the
-    exchanges of rows that make up `P`: the `k`-th number is the number of the row, counted
-    from one, that was exchanged with row `k`."""
+    """Gaussian elimination with partial pivoting. Returns what LAPACK's `getrf` does:
+
+    - the factors of `P A = L U` in one matrix, without the ones on the diagonal of L;
+    - the exchanges of rows that make up `P`: the `k`-th number is the number of the row,
+        counted from one, that was exchanged with row `k`.
+    """
     rows = [[*row] for row in a]
     num_columns = len(rows[0]) if rows else 0
     pivots = []
@@ -34,9 +37,9 @@ def _lu(a: Matrix) -> tuple[Matrix, list[Any]]:
         rows_below = range(column + 1, len(rows))
         pivot = _row_of_pivot(rows, column)
         pivots.append(pivot + 1)
-        # The row of the pivot differs between paths, and rows in registers cannot be read
-        # by a number. So each row below is exchanged with the row on the diagonal in the
-        # lanes where it is the row of the pivot.
+        # 1. Exchange the row on the diagonal and the row of the pivot. The number of this
+        # row differs between lanes, and rows in registers cannot be read by a number. So
+        # each row below is exchanged in the lanes where it is the row of the pivot.
         old_top = rows[column]
         top = old_top
         for below in rows_below:
@@ -45,8 +48,8 @@ def _lu(a: Matrix) -> tuple[Matrix, list[Any]]:
             rows[below] = _where(is_pivot, old_top, row)
             top = _where(is_pivot, row, top)
         rows[column] = top
-        # From each row below, the multiple of the row on the diagonal is subtracted that
-        # makes its entry in this column zero. The factor, an entry of L, is stored in place
+        # 2. From each row below, subtract the multiple of the row on the diagonal that
+        # makes the entry in this column zero. The factor, an entry of L, is stored in place
         # of the zero. If the pivot is zero, the entries below are zero already.
         inverse = dr.select(top[column] == 0, 0, 1 / top[column])
         for below in rows_below:
@@ -58,16 +61,16 @@ def _lu(a: Matrix) -> tuple[Matrix, list[Any]]:
 
 
 def _row_of_pivot(rows: Matrix, column: int) -> Any:
-    """The number of the row with the largest entry in this column, from the diagonal
-    down."""
-    index = array_types()["i32"]
+    """In each lane, the number of the row with the largest absolute value in this column,
+    from the diagonal down."""
+    int32 = array_types()["i32"]
     largest = dr.abs(rows[column][column])
-    pivot = index(column)
+    pivot = int32(column)
     for below in range(column + 1, len(rows)):
         size = dr.abs(rows[below][column])
         is_larger = size > largest
         largest = dr.select(is_larger, size, largest)
-        pivot = dr.select(is_larger, index(below), pivot)
+        pivot = dr.select(is_larger, int32(below), pivot)
     return pivot
 
 
@@ -97,7 +100,7 @@ def _cholesky(a: Matrix) -> tuple[Matrix, Any]:
         square = row[j]
         for k in range(j):
             square = dr.fma(-row[k], row[k], square)
-        # This marks NaN as well, for which the comparison is false.
+        # With `~`, NaN is marked as well: its comparison is false.
         failed = failed | ~(square > 0)
         row[j] = dr.sqrt(square)
         # One division for the whole column.
@@ -111,11 +114,15 @@ def _cholesky(a: Matrix) -> tuple[Matrix, Any]:
 
 
 def _solve_triangular(a: Matrix, b: Matrix, is_lower: bool, is_unit: bool) -> Matrix:
-    """The solution of `A X = B` by substitution. Reads one triangle of `A`, the lower or
-    the upper one. With `is_unit`, ones are taken in place of the diagonal."""
+    """The solution of `A X = B` by substitution, row by row: with sums over the rows `j`
+    that are solved already, `x_i = (b_i - sum a_ij x_j) / a_ii`.
+
+    Reads one triangle of `A`, the lower or the upper one. With `is_unit`, ones are taken in
+    place of the diagonal.
+    """
     n = len(a)
     rows_of_solution: dict[int, list[Any]] = {}
-    # The first row has a single unknown, and each further row one more.
+    # Solved first is the row with a single unknown. Each further row has one more.
     for i in range(n) if is_lower else reversed(range(n)):
         row = b[i]
         for j, solved_row in rows_of_solution.items():
@@ -160,11 +167,12 @@ def _potrf(operation: Operation, a: Matrix) -> list[list[Any]]:
 
 
 def _trsm(operation: Operation, a: Matrix, b: Matrix) -> list[list[Any]]:
-    """The solution of a triangular system `A X = B` or `X A = B`."""
+    """The solution of a triangular system `A X = B` or `X A = B`, where JAX may ask for the
+    transpose of `A` in its place."""
     is_lower = operation.letter("uplo") == "L"
     is_on_the_right = operation.letter("side") == "R"
-    # `X A = B` is `A^T X^T = B^T`. So `A` is transposed if it is on the right, or if JAX
-    # asks for the transpose. If both hold, the two transposes cancel.
+    # `X A = B` is the same as `A^T X^T = B^T`. So `A` is transposed if it is on the right,
+    # or if JAX asks for the transpose. If both hold, the two transposes cancel.
     is_transposed = (operation.letter("trans_x") != "N") != is_on_the_right
     x = _solve_triangular(
         _transposed(a) if is_transposed else a,
@@ -185,8 +193,8 @@ _LAPACK: dict[str, Callable[..., list[list[Any]]]] = {
 
 @rule
 def _custom_call(operation: Operation, *xs: Tensor) -> list[Tensor]:
-    """A call of LAPACK, replaced by operations on entries. All axes of an array but the
-    last two are a batch of matrices."""
+    """Does the work of a call of LAPACK, by operations on entries. Each array is a matrix
+    or, with more than two axes, a batch of matrices in the last two."""
     target = call_target(operation.mlir_op)
     # By a call of `Sharding`, older versions of JAX say on which devices an array is.
     if target == "Sharding":
@@ -195,7 +203,8 @@ def _custom_call(operation: Operation, *xs: Tensor) -> list[Tensor]:
     match = re.fullmatch("lapack_[sd](.*)_ffi", target)
     if match is None or match[1] not in _LAPACK:
         raise NotReplayed(operation.mlir_op, f"a call of `{target}`")
-    # The number of right-hand sides is limited, too: `inv` has as many as unknowns.
+    # All matrices have at most this many rows and columns, also those of right-hand sides:
+    # `inv` has as many right-hand sides as unknowns.
     if any(max(x.shape[-2:]) > _MOST_UNKNOWNS for x in xs):
         what = f"`{target}` with more than {_MOST_UNKNOWNS} unknowns"
         raise NotReplayed(operation.mlir_op, what)
@@ -203,7 +212,7 @@ def _custom_call(operation: Operation, *xs: Tensor) -> list[Tensor]:
     batches = [_matrices(x) for x in xs]
     # For each element of the batch, the entries of each array that LAPACK returns.
     results = [function(operation, *element) for element in zip(*batches, strict=True)]
-    # For each array, the entries of the whole batch.
+    # Transposed: for each array that LAPACK returns, its entries in each element.
     arrays = zip(*results)
     return [
         Tensor(_entries(list(entries)), shape)
@@ -212,6 +221,7 @@ def _custom_call(operation: Operation, *xs: Tensor) -> list[Tensor]:
 
 
 def _matrices(x: Tensor) -> list[list[Sequence[Any]]]:
-    """The rows of each matrix of a batch."""
+    """The rows of each matrix of a batch. (`x.positions` has the shape of `x`, and holds
+    the index of each entry in the list of all entries.)"""
     positions = x.positions.reshape(math.prod(x.shape[:-2]), *x.shape[-2:])
     return [[x.take(row).entries for row in matrix] for matrix in positions]

@@ -53,9 +53,13 @@ def constant_values(op: Any) -> np.ndarray:
 
 
 def _complex_constant(text: str, shape: tuple[int, ...]) -> np.ndarray:
-    """The values of a complex constant, which MLIR gives only as the text of the operation:
-    as `dense<"0x...">` with their bytes if they are many, and otherwise as pairs
-    `dense<[(1.0,2.0), ...]>`."""
+    """The values of a complex constant, read from the text of the operation, since MLIR
+    gives them in no other way. The text has one of two forms:
+
+    - `dense<"0x...">`, with the bytes of all numbers, if they are many;
+    - `dense<[(1.0,2.0), ...]>`, with pairs of a real and an imaginary part.
+    """
+    # The size of a real or imaginary part.
     num_bytes = 8 if "complex<f64>" in text else 4
     if in_hexadecimal := re.search(r'dense<"0x([0-9A-F]+)">', text):
         parts = np.frombuffer(bytes.fromhex(in_hexadecimal[1]), f"<f{num_bytes}")
@@ -96,10 +100,13 @@ class SourceLine(NamedTuple):
 
 
 def source_lines(location: str) -> list[SourceLine]:
-    """The lines of Python from which an operation was traced, innermost first. `location`
-    is the printed location of the operation, which holds each line as
-    `"fn"("file.py":12:...)`. JAX's setting `jax_traceback_in_locations_limit` says how many
-    lines JAX records."""
+    """The lines of Python from which an operation was traced: the line that made the
+    operation, then the line that called the function of this line, and so on. JAX records
+    as many lines as its setting `jax_traceback_in_locations_limit` says.
+
+    `location` is the printed location of the operation, which holds each line as
+    `"fn"("file.py":12:...)`.
+    """
     lines = re.findall(r'"([^"]*)"\("([^"]+)":(\d+)', location)
     return [
         SourceLine(_name_of_function(name), file, int(line))

@@ -1,5 +1,11 @@
 """Operations that make, move or convert single entries. It is known while the kernel is
-recorded where each entry goes."""
+recorded where each entry goes.
+
+The *position* of an entry is its index in the flat list `x.entries` of all entries of an
+array `x`. `x.positions` has the shape of `x` and holds the position of each entry. To move
+entries, NumPy moves these positions, and `x.take(positions)` is the array of the entries
+there.
+"""
 
 import functools as ft
 import operator
@@ -68,16 +74,19 @@ def _concatenate(operation: Operation, *xs: Tensor) -> list[Tensor]:
 
 @rule
 def _pad(operation: Operation, x: Tensor, value: Tensor) -> list[Tensor]:
+    """Adds the padding `value` before, between and after the entries of `x`: the entry with
+    the index `i` goes to `before + i * distance`, along each axis."""
     before = np.array(operation.integers("edge_padding_low"), int)
     distances = 1 + np.array(operation.integers("interior_padding"), int)
-    # The value comes last in this list, and is taken wherever no entry of `x` goes.
+    # The value is the last of these entries. At first it is taken everywhere, then the
+    # entries of `x` are put where they go.
     all_entries = Tensor([*x.entries, value.item()], ())
     positions = np.full(operation.shape, len(x.entries))
     for index, position in np.ndenumerate(x.positions):
-        target = before + np.array(index, int) * distances
+        new_index = before + np.array(index, int) * distances
         # A negative padding moves some entries out of the result.
-        if np.all((target >= 0) & (target < operation.shape)):
-            positions[tuple(target)] = position
+        if np.all((new_index >= 0) & (new_index < operation.shape)):
+            positions[tuple(new_index)] = position
     return [all_entries.take(positions)]
 
 
@@ -86,7 +95,7 @@ def _select(
     operation: Operation, mask: Tensor, if_true: Tensor, if_false: Tensor
 ) -> list[Tensor]:
     # With `vmap` of a conditional, JAX also selects between an array and itself. If the
-    # array is in memory, it stays there.
+    # array is in memory (its entries are a `Table`), it stays there.
     one = if_true.entries
     other = if_false.entries
     if isinstance(one, Table) and isinstance(other, Table):
@@ -126,7 +135,7 @@ def _complex(operation: Operation, real: Tensor, imag: Tensor) -> list[Tensor]:
 
 @rule
 def _compare(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
-    # The name of a direction, such as `LT`, is that of a function in `operator`.
+    # In lower case, a direction such as `LT` is the name of a function in `operator`.
     direction = operation.word("comparison_direction").lower()
     if operation.has("compare_type") and operation.word("compare_type") == "TOTALORDER":
         a = map_entries(_in_total_order, a)
@@ -135,20 +144,21 @@ def _compare(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
         return [map_entries(getattr(operator, direction), a, b)]
     is_complex = dr.is_complex_v(a.entries[0])
     is_equal = map_entries(equal if is_complex else operator.eq, a, b)
-    # `ne` is not used, since it is false for two NaNs in Dr.Jit, unless it is folded.
+    # "Not equal" is the inverse of "equal", since Dr.Jit's own `!=` is false for two NaNs
+    # (unless both are constants).
     return [is_equal if direction == "eq" else map_entries(operator.invert, is_equal)]
 
 
 def _in_total_order(a: Any) -> Any:
-    """An integer for each floating-point number, in the total order of StableHLO, in which
-    NaN with a positive sign is above infinity."""
+    """Maps floating-point numbers to integers that have the same order. This is the total
+    order of StableHLO: -0 is below 0, and NaN with a positive sign is above infinity."""
     num_bits = 8 * dr.itemsize_v(a)
     # The bits of positive numbers, read as integers, have the order of the numbers, and the
     # bits of negative numbers the reverse order.
     bits = dr.reinterpret_array(array_types()[f"i{num_bits}"], a)
-    # The shift copies the sign to all bits, so that all bits are set for a negative number,
-    # and none otherwise. The last line then flips all bits of a negative number except the
-    # sign, which reverses the order of negative numbers.
+    # So for negative numbers all bits except the sign are flipped, which reverses their
+    # order. The shift copies the sign to all bits: they are all set for a negative number,
+    # and none is set otherwise.
     filled_with_sign = bits >> (num_bits - 1)
     all_but_sign = 2 ** (num_bits - 1) - 1
     return bits ^ (filled_with_sign & all_but_sign)

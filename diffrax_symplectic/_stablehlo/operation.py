@@ -1,7 +1,8 @@
 """Operations of StableHLO, as the argument of rules; and the table of all rules.
 
-A *rule* is a function from an operation and its operands to its results. The specification
-of operations: https://openxla.org/stablehlo/spec.
+A *rule* is a function from an operation and its operands to its results. Its arrays hold
+many paths at once, each in a *lane* of its own. The specification of operations:
+https://openxla.org/stablehlo/spec.
 """
 
 import functools as ft
@@ -9,8 +10,6 @@ import operator
 import re
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeAlias
-
-import numpy as np
 
 from .._compat import is_literal
 from .backend import array_types
@@ -25,8 +24,8 @@ class Operation(NamedTuple):
     """An operation of a program.
 
     - `mlir_op`: MLIR's object for the operation.
-    - `run`: `run(i, arguments)` returns the results of region number `i`, such as the body
-        of a loop.
+    - `run`: `run(i, arguments)` returns the results of region number `i`. A *region* is
+        code that belongs to the operation, such as the body of a loop.
     - `failures`: masks of lanes whose results are not valid, for example since the program
         would raise an error in these lanes. All operations of a program append to the same
         list by `fail`. The caller of the program computes these lanes by other means.
@@ -68,8 +67,9 @@ class Operation(NamedTuple):
         return [tuple(result.type.shape) for result in self.mlir_op.results]
 
     def refusal(self, why: str) -> "NotReplayed":
-        """The error to raise if this operation cannot be replayed, with the reason after
-        the name of the operation."""
+        """The error to raise if this operation cannot be replayed. `why` stands in the
+        message after the name of the operation, as in "`stablehlo.sort` of more than 16
+        numbers"."""
         return NotReplayed(self.mlir_op, f"`{self.full_name}` {why}")
 
     # The methods below read an attribute of the operation, by its name in StableHLO. If one
@@ -80,14 +80,12 @@ class Operation(NamedTuple):
         return name in self.mlir_op.attributes
 
     def integers(self, name: str) -> list[int]:
-        """A list of integers, which is empty if there is no attribute of this name."""
+        """The integers of a list or, row by row, of a matrix. If there is no attribute of
+        this name, the list is empty."""
         return [int(i) for i in self.mlir_op.attributes[name]] if self.has(name) else []
 
     def integer(self, name: str) -> int:
         return self.mlir_op.attributes[name].value
-
-    def matrix(self, name: str) -> np.ndarray:
-        return np.asarray(self.mlir_op.attributes[name])
 
     def letter(self, name: str) -> str:
         """An argument of LAPACK, such as `U` for an upper triangle."""
@@ -98,15 +96,16 @@ class Operation(NamedTuple):
         `#stablehlo<comparison_direction LT>`."""
         return re.findall(r"\w+", str(self.mlir_op.attributes[name]))[-1]
 
-    def part(self, name: str, key: str) -> list[int]:
-        """The numbers of the entry `key` of an attribute with several entries. MLIR gives
-        it only in printed form, as
-        `#stablehlo.gather<offset_dims = [0], index_vector_dim = 1>`. An entry that is zero
-        or empty is not printed, and read as an empty list."""
-        text = str(self.mlir_op.attributes[name])
+    def integers_of_field(self, name: str, field: str) -> list[int]:
+        """The integers in a field of an attribute that has several fields. MLIR gives such
+        an attribute only in printed form, as
+        `#stablehlo.gather<offset_dims = [0, 2], index_vector_dim = 1>`. A single number is
+        returned as a list of one. A field that is zero or empty is not printed, and the
+        list is empty."""
+        printed = str(self.mlir_op.attributes[name])
         # A list in brackets, or a single number.
-        entry = re.search(rf"\b{key} = (\[[^\]]*\]|\d+)", text)
-        return [] if entry is None else [*map(int, re.findall(r"\d+", entry[1]))]
+        value = re.search(rf"\b{field} = (\[[^\]]*\]|\d+)", printed)
+        return [] if value is None else [*map(int, re.findall(r"\d+", value[1]))]
 
     def fail(self, mask: Any) -> None:
         """Marks the lanes of this mask as failed."""
@@ -116,17 +115,19 @@ class Operation(NamedTuple):
             self.failures.append(mask)
 
     def with_failures(self, fn: Callable[[], Any]) -> tuple[Any, Any]:
-        """Calls `fn`, and returns its results and the mask of the lanes that fail in it.
+        """Calls `fn`, which runs a region of a loop or conditional of the kernel. Returns
+        its results, and the mask of the lanes that fail in it.
 
-        The mask is not left in `failures`: if it is recorded within a loop or branch, it
-        cannot be used outside, so the loop or branch has to return it.
+        The masks that `fn` adds to `failures` are removed from there. Dr.Jit allows no use
+        of them outside of the loop or branch in which they were recorded, unless the loop
+        or branch returns them.
         """
         num_before = len(self.failures)
-        returned = fn()
+        results = fn()
         new_failures = self.failures[num_before:]
         del self.failures[num_before:]
         no_lane = array_types()["i1"](False)
-        return returned, ft.reduce(operator.or_, new_failures, no_lane)
+        return results, ft.reduce(operator.or_, new_failures, no_lane)
 
 
 class NotReplayed(Exception):

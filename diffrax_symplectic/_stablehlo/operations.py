@@ -13,10 +13,11 @@ from .tensor import map_entries, Tensor
 
 
 class _Limit(NamedTuple):
-    """Where Dr.Jit has right results.
+    """For which operands Dr.Jit's function is accurate: those for which the absolute value
+    of a certain number is at most `largest`.
 
-    - `number`: a number, as a function of the operands.
-    - `largest`: its largest absolute value, for each size of numbers in bytes.
+    - `number`: maps the operands to this number, such as the angle of a sine.
+    - `largest`: the limit, by the size of the number's type in bytes: 4 or 8.
     """
 
     number: Callable[..., Any]
@@ -35,7 +36,7 @@ def _itself(a):
 
 
 def _quotient(a, b):
-    # The remainder by zero is NaN, whatever the quotient.
+    # The remainder by zero is NaN, which needs no limit. So its quotient counts as zero.
     return dr.select(b == 0, 0, a / b)
 
 
@@ -56,7 +57,8 @@ _LIMITS_OF_COMPLEX = {
 
 
 def entry_by_entry(operation: Operation, *xs: Tensor) -> list[Tensor]:
-    """The rule of all operations that have no rule of their own."""
+    """The rule of all operations that have no rule of their own: applies a function to each
+    entry, and marks the lanes as failed in which the function is not accurate."""
     name = operation.name
     if name not in elementwise() and name not in complex_functions():
         raise NotReplayed(operation.mlir_op)
@@ -68,11 +70,11 @@ def entry_by_entry(operation: Operation, *xs: Tensor) -> list[Tensor]:
         raise operation.refusal(f"of {'complex' if is_complex else 'real'} numbers")
 
     def applied(*entries: Any) -> Any:
-        # Remainders of integers have no limit.
+        # Remainders of integers are exact, and need no limit.
         if name in limits and not dr.is_integral_v(entries[0]):
             number = limits[name].number(*entries)
             largest = limits[name].largest[dr.itemsize_v(number)]
-            # Beyond it Dr.Jit's result is wrong: these lanes fail.
+            # Lanes beyond the limit fail. (NaN does not: the function returns NaN.)
             operation.fail(dr.abs(number) > largest)
         return functions[name](*entries)
 

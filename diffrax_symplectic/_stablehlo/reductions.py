@@ -1,4 +1,8 @@
-"""Operations that combine entries of an array: products of matrices, sums, sorting."""
+"""Operations that combine entries of an array: products of matrices, sums, sorting.
+
+The *position* of an entry is its index in the flat list `x.entries` of all entries of an
+array `x`. `x.positions` has the shape of `x` and holds the position of each entry.
+"""
 
 import functools as ft
 import itertools
@@ -22,10 +26,11 @@ _MOST_SORTED = 16
 
 @rule
 def _dot_general(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
-    # Of shapes (batch, rows, summed) and (batch, columns, summed). An entry of the result
-    # is the inner product of a row of `a` and a column of `b`.
-    positions_in_a = _positions_as_matrices(operation, a, side="lhs")
-    positions_in_b = _positions_as_matrices(operation, b, side="rhs")
+    """A batch of products of matrices: each entry of the result is the inner product of a
+    row of `a` and a column of `b`."""
+    # Of shapes (batch, rows, summed) and (batch, columns, summed).
+    positions_in_a = _positions_by_axis_group(operation, a, side="lhs")
+    positions_in_b = _positions_by_axis_group(operation, b, side="rhs")
     batch_size, num_rows, _ = positions_in_a.shape
     _, num_columns, _ = positions_in_b.shape
     # Products and sums have the type of the result, to which other numbers are converted.
@@ -43,10 +48,10 @@ def _dot_general(operation: Operation, a: Tensor, b: Tensor) -> list[Tensor]:
 def _inner_product(row: list[Any], column: list[Any], dtype: type) -> Any:
     """The sum of the products of the numbers of a row and a column of type `dtype`."""
     total = dtype(0)
-    # Dr.Jit replaces each product with a constant zero by zero. But zero times infinity or
-    # NaN is NaN, so these products are added here: first the products with zeros in the
-    # row, then the products with zeros in the column. (Products of complex numbers with
-    # zeros are left out, as in `complex.py`.)
+    # Dr.Jit replaces a product with a constant zero by zero, even if the other factor is
+    # infinite or NaN, and the product should be NaN. The next lines add 0, or NaN if one of
+    # these products should be NaN. (Complex numbers are left as Dr.Jit has them, as in
+    # `complex.py`.)
     if dr.is_float_v(dtype) and not dr.is_complex_v(dtype):
         total = total + _zero_or_nan(factors=row, others=column)
         total = total + _zero_or_nan(factors=column, others=row)
@@ -56,8 +61,10 @@ def _inner_product(row: list[Any], column: list[Any], dtype: type) -> Any:
 
 
 def _zero_or_nan(factors: Sequence[Any], others: Sequence[Any]) -> Any:
-    """The sum of products of `others` with constant zeros among `factors`: zero, or NaN if
-    one of the `others` that is not a constant is infinite or NaN."""
+    """What to add to a sum of products so that it becomes NaN where it should. If one of
+    the `factors` is a constant zero, this is NaN in the lanes where any of the `others` is
+    infinite or NaN. Otherwise it is 0. Constants among the `others` are taken to be finite.
+    """
     unknown = [x for x in others if not is_literal(x)]
     if not unknown or not any(map(is_zero, factors)):
         return 0
@@ -68,13 +75,14 @@ def _zero_or_nan(factors: Sequence[Any], others: Sequence[Any]) -> Any:
     return total - total
 
 
-def _positions_as_matrices(operation: Operation, x: Tensor, side: str) -> np.ndarray:
-    """The positions of the entries of an operand `x` of `dot_general`, which is the `lhs`
-    or the `rhs`, as an array of shape (batch, kept, summed). Each of its axes stands for a
-    group of axes of `x`."""
-    name = "dot_dimension_numbers"
-    batch = operation.part(name, f"{side}_batching_dimensions")
-    summed = operation.part(name, f"{side}_contracting_dimensions")
+def _positions_by_axis_group(operation: Operation, x: Tensor, side: str) -> np.ndarray:
+    """The positions of the entries of an operand `x` of `dot_general`, as an array of shape
+    (batch, kept, summed). In it each group of axes of `x` is merged into one axis: the axes
+    of the batch, those that the result keeps, and those that are summed over. `side` is
+    `lhs` or `rhs`, as in the names of MLIR."""
+    axes_of = ft.partial(operation.integers_of_field, "dot_dimension_numbers")
+    batch = axes_of(f"{side}_batching_dimensions")
+    summed = axes_of(f"{side}_contracting_dimensions")
     kept = [axis for axis in range(len(x.shape)) if axis not in (*batch, *summed)]
     groups = (batch, kept, summed)
     sizes = [math.prod(x.shape[axis] for axis in axes) for axes in groups]
@@ -83,10 +91,12 @@ def _positions_as_matrices(operation: Operation, x: Tensor, side: str) -> np.nda
 
 @rule
 def _reduce(operation: Operation, *operands: Tensor) -> list[Tensor]:
+    """Sums, and other reductions along whole axes."""
     x = operands[0]
     axes = operation.integers("dimensions")
     kept = [axis for axis in range(len(x.shape)) if axis not in axes]
     positions = x.positions.transpose(*kept, *axes)
+    # A row for each entry of the result.
     groups = positions.reshape(math.prod(operation.shape), -1)
     return _reduced(operation, operands, groups)
 
@@ -94,31 +104,34 @@ def _reduce(operation: Operation, *operands: Tensor) -> list[Tensor]:
 def _reduced(
     operation: Operation, operands: Sequence[Tensor], groups: Iterable[Iterable[Any]]
 ) -> list[Tensor]:
-    """The results of a reduction by the operation's region, such as an addition.
+    """The results of a reduction of one or more arrays of the same shape together. (So
+    `argmax` reduces an array together with its indices.)
 
-    The first half of the `operands` are arrays of the same shape, and the second half the
-    initial values for each of them. The region combines one entry of each array, since the
-    result of one array may depend on the others: `argmax` reduces an array together with
-    its indices.
+    - `operands` are the arrays, followed by an initial value for each array.
+    - `groups` has, for each entry of a result in row-major order, the positions of the
+        entries that are reduced to it.
 
-    For each entry of a result, in row-major order, `groups` has the positions of the
-    entries that are reduced to it.
+    The operation's region, such as an addition, maps the totals so far and an entry of each
+    array to the next totals.
     """
     num_arrays = len(operands) // 2
     arrays = operands[:num_arrays]
-    totals = []
+    initial_values = operands[num_arrays:]
+    totals_of_groups = []
     for positions in groups:
-        total = operands[num_arrays:]
+        totals = initial_values
         for position in positions:
             entries = [scalar(x.entries[position]) for x in arrays]
-            total = operation.run(ONLY_REGION, [*total, *entries])
-        totals.append([x.item() for x in total])
-    return [Tensor(entries, operation.shape) for entries in zip(*totals)]
+            totals = operation.run(ONLY_REGION, [*totals, *entries])
+        totals_of_groups.append([x.item() for x in totals])
+    # Transposed, these are the entries of each result.
+    return [Tensor(entries, operation.shape) for entries in zip(*totals_of_groups)]
 
 
 @rule
 def _reduce_window(operation: Operation, *operands: Tensor) -> list[Tensor]:
-    """Cumulative sums, and other reductions of windows."""
+    """Cumulative sums, and other reductions of windows: parts of an array, all of the same
+    size."""
     if any(size > 1 for size in operation.integers("base_dilations")):
         raise operation.refusal("with a base dilation")
     x = operands[0]
@@ -127,21 +140,21 @@ def _reduce_window(operation: Operation, *operands: Tensor) -> list[Tensor]:
     # each axis if there is no such attribute.
     strides = np.array(operation.integers("window_strides") or 1)
     distances = np.array(operation.integers("window_dilations") or 1)
-    # For each axis, the padding before and after.
-    padding = (
-        operation.matrix("padding") if operation.has("padding") else np.zeros(2, int)
-    )
-    padding_before = padding.reshape(-1, 2)[:, 0]
+    # Two numbers for each axis, the padding before and after. Without the attribute, both
+    # are zero along all axes.
+    padding = operation.integers("padding") or [0, 0]
+    padding_before = np.array(padding[::2])
     groups = []
     for window in np.ndindex(*operation.shape):
-        corner = np.array(window) * strides - padding_before
-        indices = [
-            corner + np.array(offset) * distances for offset in np.ndindex(*sizes)
-        ]
-        # Entries in the padding are left out, as XLA does. In the specification they are
-        # the initial value, which makes no difference if this value is neutral.
-        inside = [i for i in indices if np.all((i >= 0) & (i < x.shape))]
-        groups.append([x.positions[tuple(index)] for index in inside])
+        first_index = np.array(window) * strides - padding_before
+        positions = []
+        for offset in np.ndindex(*sizes):
+            index = first_index + np.array(offset) * distances
+            # Entries in the padding are left out, as XLA does. In the specification they
+            # are the initial value, which makes no difference if this value is neutral.
+            if np.all((index >= 0) & (index < x.shape)):
+                positions.append(x.positions[tuple(index)])
+        groups.append(positions)
     return _reduced(operation, operands, groups)
 
 
@@ -155,12 +168,13 @@ def _sort(operation: Operation, *xs: Tensor) -> list[Tensor]:
         raise operation.refusal(f"of more than {_MOST_SORTED} numbers")
     arrays = [[*x.entries] for x in xs]
     for positions in np.moveaxis(xs[0].positions, axis, -1).reshape(-1, length):
-        # Each round moves the largest of the entries before `end` to the last of them.
+        # Each round moves the largest of the first `end` entries to the end of them.
         for end in range(length, 1, -1):
             for left, right in itertools.pairwise(positions[:end]):
                 # The region takes two entries of each array, and returns whether the first
-                # of the two must stand before the second. It gets the right one as the
-                # first: for equal entries it returns false, so that they are not exchanged.
+                # of the two must stand before the second. Here the right entry is passed
+                # first: for equal entries the region returns false, so that they are not
+                # exchanged.
                 pairs = [scalar(array[i]) for array in arrays for i in (right, left)]
                 (right_comes_first,) = operation.run(ONLY_REGION, pairs)
                 is_wrong_order = right_comes_first.item()

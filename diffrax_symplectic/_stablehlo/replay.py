@@ -1,5 +1,11 @@
 """Replays a program that JAX lowered for one path: runs its operations on arrays that hold
-many paths."""
+many paths, each in a *lane* of its own.
+
+A program in MLIR consists of functions. A function has a *block*, a list of operations that
+ends with what the block returns. Some operations have *regions*, such as the body of a
+loop, each with a block of its own. A *variable* is an argument of a block or a result of an
+operation.
+"""
 
 from collections import ChainMap
 from collections.abc import Iterator, Sequence
@@ -23,9 +29,9 @@ from .tensor import array_in_memory, ArrayType, MOST_IN_REGISTERS, Table, Tensor
 
 _RETURNS = ("func.return", "stablehlo.return")
 
-# The tensor of each variable of the program. A region sees the variables of the block
-# around it, but the block does not see those of the region: so each block has a map of its
-# own.
+# The tensor of each variable of a block. The block of a region sees the variables of the
+# block around it, which does not see those of the region. So the map of each block has the
+# map of the block around it behind it.
 Values: TypeAlias = ChainMap[Any, Tensor]
 
 
@@ -43,8 +49,8 @@ class Replay:
         # Operations exist only as long as the module, so the module is kept.
         self._module = stablehlo_module(program)
         self._functions = functions_of(self._module)
-        # The values of large constants, which have too many entries for registers, by their
-        # variables.
+        # From the variables of large constants, which have too many entries for registers,
+        # to their values.
         self._constants = {
             op.results[0]: constant_values(op)
             for op in _operations_within(self._module.operation)
@@ -65,7 +71,7 @@ class Replay:
 
     @property
     def returned_arguments(self) -> list[int | None]:
-        """For each result, the number of the argument that the program returns unchanged as
+        """For each result, the index of the argument that the program returns unchanged as
         this result, or `None` if there is none."""
         arguments = [*self._main.arguments]
         *_, last = self._main.operations
@@ -125,12 +131,11 @@ class _Run(NamedTuple):
     def run_block(
         self, block: Any, args: Sequence[Tensor], outer: Values
     ) -> list[Tensor]:
-        """The results of a block, whose operations run one after another. `outer` holds the
-        variables that the block sees from outside."""
+        """Runs the operations of a block one after another, and returns the results of the
+        block. `outer` holds the variables that the block sees from outside."""
         values = outer.new_child(dict(zip(block.arguments, args)))
+        # For some operations MLIR has classes of their own. Here all have the general one.
         for view in block.operations:
-            # For some operations MLIR has classes of their own. `operation` has the class
-            # of all operations.
             op = view.operation
             operands = [values[operand] for operand in op.operands]
             if op.name in _RETURNS:
@@ -141,13 +146,18 @@ class _Run(NamedTuple):
     def results_of(
         self, op: Any, operands: list[Tensor], values: Values
     ) -> list[Tensor]:
-        """The results of an operation in a block with the variables `values`."""
+        """The results of an operation in a block with the variables `values`: by its rule,
+        unless it is
+
+        - a call of a function of the program,
+        - a large constant, which is in memory,
+        - or an operation whose results have no entries: there is nothing to compute.
+        """
         if op.name == "func.call":
             return self.results_of_call(op, operands)
         if op.results and op.results[0] in self.tables:
             return [self.tables[op.results[0]]]
-        # Rules need not treat results without entries: there is nothing to compute. (A
-        # token, which orders side effects, has no shape.)
+        # A result without a shape is a token, which orders side effects: `()` stands in.
         shapes = [tuple(getattr(result.type, "shape", ())) for result in op.results]
         if shapes and all(0 in shape for shape in shapes):
             return [Tensor([], shape) for shape in shapes]
@@ -160,6 +170,7 @@ class _Run(NamedTuple):
         try:
             return rule(operation, *operands)
         except (TypeError, RuntimeError) as error:
+            # An operation in a region of this one may have been refused already.
             if _names_an_operation(error):
                 raise
             # Errors of Dr.Jit name neither the operation nor its location.

@@ -1,7 +1,8 @@
-"""Arrays of one path, for all paths at once: each entry is a Dr.Jit array with one lane for
-each path.
+"""Arrays of one path, for all paths at once: each entry is a Dr.Jit array with one *lane*
+for each path.
 
-The *position* of an entry is its index in the list of the entries in row-major order.
+The *position* of an entry is its index in the flat list of all entries, which is in
+row-major order.
 """
 
 import dataclasses
@@ -74,8 +75,9 @@ class Tensor:
 
     @property
     def positions(self) -> np.ndarray:
-        """The positions of the entries, as an array of this shape. A rule that moves
-        entries lets NumPy move the positions, and then takes the entries there."""
+        """The positions `0, 1, 2, ...` of the entries, as an array of this shape. A rule
+        that moves entries lets NumPy move the positions, and then takes the entries there:
+        `x.take(x.positions.T)` is the transpose."""
         return np.arange(len(self.entries)).reshape(self.shape)
 
     def take(self, positions: np.ndarray) -> "Tensor":
@@ -126,14 +128,15 @@ def known_value(x: Tensor) -> Any | None:
     Where a value is known, loops are unrolled and entries selected at this time.
     """
     entry = x.item()
+    # A constant has the same value in all lanes, so that the first lane gives it.
     return entry[0] if is_literal(entry) else None
 
 
 def map_entries(fn: Callable, *xs: Tensor) -> Tensor:
     """Applies a function entry by entry. The arrays have the same shape, except for
     scalars, which are repeated as needed."""
-    # The result has the shape of the largest array. An array of shape (1,) counts as larger
-    # than a scalar.
+    # The result has the shape of the largest array. Among arrays with one entry, an array
+    # of shape (1,) counts as larger than a scalar.
     largest = max(xs, key=lambda x: (len(x.entries), len(x.shape)))
     size = len(largest.entries)
     operands = [
@@ -164,16 +167,16 @@ def tensors_from(
 def copied_entries(xs: Sequence[Tensor]) -> tuple[Any, ...]:
     """Copies of the entries of these tensors.
 
-    A branch or the body of a loop must return copies. Dr.Jit writes the result of a
-    conditional into the objects that a branch returned: without a copy, a variable from
-    outside of the branch that the branch returns would change everywhere.
+    A branch or the body of a loop must return copies, since Dr.Jit writes the results of a
+    conditional into the objects that a branch returned. If a branch returned a variable
+    from outside of the branch itself, this variable would change wherever it is used.
     """
     return tuple(type(entry)(entry) for entry in entries_of(xs))
 
 
 def usable_outside(entry: Any) -> Any:
-    """An entry that a conditional or loop returned, for use after the conditional or loop:
-    constants are made anew.
+    """The same value as `entry`, which a conditional or loop of the kernel returned, for
+    use after the conditional or loop: a constant is replaced by a new constant.
 
     If both branches return the same constant, Dr.Jit returns the constant of the second
     branch, which is defined within this branch only. LLVM aborts the process if an outer
@@ -182,4 +185,6 @@ def usable_outside(entry: Any) -> Any:
     if dr.is_complex_v(entry):
         # One part of a complex number may be a constant, and the other not.
         return type(entry)(usable_outside(entry.real), usable_outside(entry.imag))
+    # A constant has the same value in all lanes, so that the first lane gives it. Dr.Jit
+    # knows this value while it records: to read it runs no kernel.
     return type(entry)(entry[0]) if is_literal(entry) else entry

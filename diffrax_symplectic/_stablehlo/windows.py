@@ -4,6 +4,9 @@ paths.
 A *window* is a part of an array, a slice along each axis. Its *start* along an axis is the
 index at which the slice begins.
 
+The *position* of an entry is its index in the flat list `x.entries` of all entries of an
+array `x`. `x.positions` has the shape of `x` and holds the position of each entry.
+
 An array in memory is read at the addresses that each path computes from the starts. Entries
 in registers have no address. There all windows that are possible are taken, with a mask of
 the lanes whose starts are those of the window, and for each lane one of them is selected.
@@ -45,9 +48,10 @@ def _masks_of_starts(start: Tensor, last: int, is_clipped: bool) -> dict[int, An
     `is_clipped`, it has no mask.
     """
     every_lane = array_types()["i1"](True)
-    value = known_value(start)
     if last == 0 and is_clipped:
         return {0: every_lane}
+    # A start that is known while the kernel is recorded is the same in all lanes.
+    value = known_value(start)
     if value is not None:
         nearest = min(max(value, 0), last)
         return {nearest: every_lane} if is_clipped or value == nearest else {}
@@ -65,9 +69,14 @@ def _possible_windows(
     sizes: Sequence[int],
     is_clipped: bool,
 ) -> Iterator[tuple[tuple[slice, ...], Any]]:
-    """All windows of `x` of these sizes that some lane may have. For each window, yields
-    its slices and the mask of the lanes that have it. `starts` and `sizes` have an element
-    for each axis of `x`, and `is_clipped` is explained in `_masks_of_starts`."""
+    """For each window of `x` that some lane may have, yields its slices and the mask of the
+    lanes that have it.
+
+    - `starts` and `sizes` have an element for each axis of `x`.
+    - With `is_clipped`, a window that would reach beyond an end of `x` is moved inside.
+        Without `is_clipped`, no mask has the lanes with such a window.
+    """
+    # For each axis, the masks by the index at which a window starts.
     masks_of_axes = [
         _masks_of_starts(start, length - size, is_clipped)
         for start, length, size in zip(starts, x.shape, sizes)
@@ -83,13 +92,15 @@ def _possible_windows(
     for begins in itertools.product(*masks_of_axes):
         slices = [slice(begin, begin + size) for begin, size in zip(begins, sizes)]
         masks = [of_axis[begin] for of_axis, begin in zip(masks_of_axes, begins)]
+        # A lane has the window if it has the window's start along each axis. (An array
+        # without axes has one window, in every lane.)
         yield tuple(slices), ft.reduce(operator.and_, masks, array_types()["i1"](True))
 
 
 def _selected(choices: Iterable[tuple[Any, Tensor]]) -> Tensor:
     """In each lane the tensor whose mask is true. `choices` are one or more pairs of a mask
     and a tensor. In each lane exactly one mask is true."""
-    # So the first mask is not needed: where it is false, another tensor is selected.
+    # The first mask is not needed: where it is false, one of the others is true.
     (_, selected), *others = choices
     for mask, choice in others:
         selected = map_entries(ft.partial(dr.select, mask), choice, selected)
@@ -100,7 +111,9 @@ def _window_at(
     operation: Operation, x: Tensor, starts: Sequence[Tensor], sizes: Sequence[int]
 ) -> Tensor:
     """The window of `x` that begins at `starts`, moved into `x` if it would reach beyond
-    the ends. `starts` and `sizes` have an element for each axis of `x`."""
+    an end. `starts` and `sizes` have an element for each axis of `x`."""
+    # A `Table` means entries in memory, which have an address. It is needed only if the
+    # starts differ between paths.
     is_same_for_all_paths = all(known_value(start) is not None for start in starts)
     if isinstance(x.entries, Table) and not is_same_for_all_paths:
         return _window_of_table(operation, x, x.entries, starts, sizes)
@@ -118,8 +131,8 @@ def _window_of_table(
     """What `_window_at` returns if the entries of `x` are those of a `table`: each path
     reads its own window from memory."""
     strides = _strides(operation, table, x.shape)
-    # The address of the window's first entry differs from that of the first entry of `x`
-    # by an index times a stride along each axis.
+    # The address of the window's first entry is the sum of the address of the first entry
+    # of `x` and, for each axis, the window's start times the stride.
     int32 = array_types()["i32"]
     first_address = int32(int(table.addresses[0]))
     for start, stride, length, size in zip(starts, strides, x.shape, sizes):
@@ -144,10 +157,13 @@ def _strides(operation: Operation, table: Table, shape: tuple[int, ...]) -> list
     operation cannot be replayed."""
     addresses = table.addresses.reshape(shape)
     first = int(addresses.flat[0])
+    # Along each axis, the distance from the first entry to the next one. Along an axis of
+    # length one there is none, and any stride would do.
     strides = [
         int(addresses.take(1, axis).flat[0]) - first if size > 1 else 0
         for axis, size in enumerate(shape)
     ]
+    # These are the strides only if all entries are where the strides say.
     if not np.array_equal(first + _offsets(strides, shape), addresses):
         raise operation.refusal(
             "with an index per path, from an array whose entries were moved other than by "
@@ -176,7 +192,9 @@ def _dynamic_slice(operation: Operation, x: Tensor, *starts: Tensor) -> list[Ten
 def _dynamic_update_slice(
     operation: Operation, x: Tensor, update: Tensor, *starts: Tensor
 ) -> list[Tensor]:
-    # Each possible result takes its entries from one list, in which the entries of the
+    """Makes the result for each window that may be updated, and selects one in each
+    lane."""
+    # Each of these results takes its entries from one list, in which the entries of the
     # update follow those of `x`.
     both = Tensor(entries_of([x, update]), ())
     results = []
@@ -195,17 +213,17 @@ def _starts_of_windows(
     axes: Sequence[int],
     batched_axes: dict[int, int],
 ) -> tuple[tuple[int, ...], list[list[Tensor]]]:
-    """The windows of `x` that a `gather` reads or a `scatter` writes. Returns the shape of
-    the array of windows, and for each window, in row-major order, its start along each axis
-    of `x`.
+    """Where the windows of `x` start that a `gather` reads or a `scatter` writes. Along its
+    axis `index_vector_dim`, the array `indices` has the starts of a window. Its other axes
+    are the axes of an array of windows.
 
-    The array of windows has the axes of `indices` except `index_vector_dim`, along which
-    stand the starts of a window. A window starts
+    Returns the shape of the array of windows, and for each window, in row-major order, its
+    start along each axis of `x`:
 
-    - along each of `axes`, at the index in `indices`;
-    - along an axis of `x` that `batched_axes` maps to an axis of `indices`, at the window's
+    - along each of `axes`, the start that `indices` has;
+    - along an axis of `x` that `batched_axes` maps to an axis of `indices`, the window's
         own index along this axis in the array of windows;
-    - along all other axes, at zero.
+    - along all other axes, zero.
     """
     # MLIR prints this number only if it is not zero. An empty list has the sum zero.
     vector_axis = sum(index_vector_dim)
@@ -214,15 +232,18 @@ def _starts_of_windows(
     if vector_axis == positions.ndim:
         positions = positions[..., None]
     axes_of_windows = [axis for axis in range(positions.ndim) if axis != vector_axis]
-    vectors = np.moveaxis(positions, vector_axis, -1)
-    shape = vectors.shape[:-1]
+    # For each window, the positions in `indices` of its starts.
+    positions_of_starts = np.moveaxis(positions, vector_axis, -1)
+    shape = positions_of_starts.shape[:-1]
 
     def starts_of(window: tuple[int, ...]) -> list[Tensor]:
+        """The starts of the window with this index in the array of windows."""
+        # First the starts that are the same in all lanes, then those in `indices`.
         known = np.zeros(len(x.shape), int)
         for axis, axis_of_indices in batched_axes.items():
             known[axis] = window[axes_of_windows.index(axis_of_indices)]
         starts = [constant(array_types()["i32"], np.asarray(start)) for start in known]
-        for axis, position in zip(axes, vectors[window]):
+        for axis, position in zip(axes, positions_of_starts[window]):
             starts[axis] = scalar(indices.entries[position])
         return starts
 
@@ -231,58 +252,62 @@ def _starts_of_windows(
 
 @rule
 def _gather(operation: Operation, x: Tensor, indices: Tensor) -> list[Tensor]:
-    part = ft.partial(operation.part, "dimension_numbers")
-    batched_axes = part("operand_batching_dims")
+    """Reads a window of `x` for each vector of starts in `indices`."""
+    field = ft.partial(operation.integers_of_field, "dimension_numbers")
+    batched_axes = field("operand_batching_dims")
     shape, starts_of_windows = _starts_of_windows(
         x,
         indices,
-        index_vector_dim=part("index_vector_dim"),
-        axes=part("start_index_map"),
-        batched_axes=dict(zip(batched_axes, part("start_indices_batching_dims"))),
+        index_vector_dim=field("index_vector_dim"),
+        axes=field("start_index_map"),
+        batched_axes=dict(zip(batched_axes, field("start_indices_batching_dims"))),
     )
     sizes = operation.integers("slice_sizes")
     windows = [_window_at(operation, x, starts, sizes) for starts in starts_of_windows]
+    # The axes of the array of windows come first, then the axes of a window.
     array = Tensor(entries_of(windows), (*shape, *sizes))
     # These axes of a window have length one, and are no axes of the result.
-    dropped = [*part("collapsed_slice_dims"), *batched_axes]
+    dropped = [*field("collapsed_slice_dims"), *batched_axes]
     positions = array.positions.squeeze(tuple(len(shape) + axis for axis in dropped))
-    # Here the remaining axes of a window are the last axes. In the result they are the axes
-    # `offset_dims`.
-    last_axes = range(len(shape), positions.ndim)
-    return [array.take(np.moveaxis(positions, last_axes, part("offset_dims")))]
+    # In the result the remaining axes of a window are the axes `offset_dims`.
+    axes_in_window = range(len(shape), positions.ndim)
+    return [array.take(np.moveaxis(positions, axes_in_window, field("offset_dims")))]
 
 
 @rule
 def _scatter(
     operation: Operation, x: Tensor, indices: Tensor, updates: Tensor
 ) -> list[Tensor]:
-    part = ft.partial(operation.part, "scatter_dimension_numbers")
-    batched_axes = part("input_batching_dims")
+    """Writes to a window of `x` for each vector of starts in `indices`. The operation's
+    region maps an old entry and its update to the new entry, such as their sum."""
+    field = ft.partial(operation.integers_of_field, "scatter_dimension_numbers")
+    batched_axes = field("input_batching_dims")
     shape, starts_of_windows = _starts_of_windows(
         x,
         indices,
-        index_vector_dim=part("index_vector_dim"),
-        axes=part("scatter_dims_to_operand_dims"),
-        batched_axes=dict(zip(batched_axes, part("scatter_indices_batching_dims"))),
+        index_vector_dim=field("index_vector_dim"),
+        axes=field("scatter_dims_to_operand_dims"),
+        batched_axes=dict(zip(batched_axes, field("scatter_indices_batching_dims"))),
     )
-    # In `updates` the axes `update_window_dims` are those of a window. Here they become the
-    # last axes.
-    window_axes = part("update_window_dims")
+    # In `updates` the axes of a window are `update_window_dims`. Here they become the last
+    # axes, and all axes before them become one. So `windows` has, for each window, the
+    # positions in `updates` of its entries.
+    window_axes = field("update_window_dims")
     last_axes = range(len(shape), updates.positions.ndim)
     positions = np.moveaxis(updates.positions, window_axes, last_axes)
-    # Along these axes of `x` a window has length one. `updates` has no axes for them.
-    added_axes = sorted([*part("inserted_window_dims"), *batched_axes])
     windows = positions.reshape(math.prod(shape), *positions.shape[len(shape) :])
+    # Along these axes of `x` a window has length one. `updates` has no axes for them.
+    added_axes = sorted([*field("inserted_window_dims"), *batched_axes])
     entries = [*x.entries]
-    # Windows are written one after another, since they may overlap, and the region may add
-    # an update to the old entry. Windows that are not within `x` are not written at all.
-    for starts, window_in_updates in zip(starts_of_windows, windows):
-        window = np.expand_dims(window_in_updates, added_axes)
+    # Windows are written one after another, since they may overlap, and a new entry may
+    # depend on the old one. Windows that are not within `x` are not written at all.
+    for starts, window in zip(starts_of_windows, windows):
+        sources = np.expand_dims(window, added_axes)
         possible_windows = _possible_windows(
-            operation, x, starts, window.shape, is_clipped=False
+            operation, x, starts, sources.shape, is_clipped=False
         )
         for slices, mask in possible_windows:
-            for target, source in zip(x.positions[slices].flat, window.flat):
+            for source, target in zip(sources.flat, x.positions[slices].flat):
                 old = scalar(entries[target])
                 update = scalar(updates.entries[source])
                 (new,) = operation.run(ONLY_REGION, [old, update])
