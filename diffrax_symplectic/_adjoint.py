@@ -192,7 +192,7 @@ class _Residuals(NamedTuple):
     - `checkpoints`: states at evenly spaced steps, along the first axis.
     - `y1`: the state at the end.
     - `num_steps`: the number of steps made.
-    - `num_saved`: the number of times of `SaveAt(ts=...)`.
+    - `num_saved`: the number of times of `SaveAt(ts=...)` that the solve has reached.
     """
 
     checkpoints: PyTree[Array]
@@ -408,7 +408,8 @@ def _y_after_step(parameters: PyTree, t0: Any, t1: Any, y0: Y, solver_state: Any
     state of the solver, for its structure."""
     args, terms, solver = parameters
     # The solver state belongs to another step, so the step is made as after a jump.
-    y1, *_ = solver.step(terms, t0, t1, y0, args, solver_state, made_jump=True)
+    made_jump = True
+    y1, *_ = solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
     return y1
 
 

@@ -325,8 +325,8 @@ class System(NamedTuple):
         # A system of no structure is not separable, so that it has a reason.
         structure = " and ".join(self.structures) or f"general ({reason})"
         description = f"The system is {structure}, with {parts}."
-        # There is nothing to change in a separable system, or in one for which solvers for
-        # heat baths are suggested.
+        # There is nothing to change in a separable system, or in one with friction that
+        # solvers for heat baths treat apart.
         if fault is None or self.friction:
             return description
         # Without any structure, the reason is in the description already.

@@ -56,8 +56,8 @@ _FEWEST_PATHS_OF_REPLICATE = 2**7
 _REPLICATES_OF_TRIAL = 8
 _PATHS_OF_SORTED_TRIAL = 2**12
 _PATHS_OF_TRIAL = 2**14
-# Sorted paths take at most this many words per step, integers of 32 random bits of which
-# increments are made: to scramble more takes long.
+# By default, paths are sorted only with at most this many words per step, integers of 32
+# random bits of which increments are made: to scramble more takes long.
 _MOST_WORDS = 2**8
 
 

@@ -291,8 +291,8 @@ def _message_on_rounding(estimate: Expectation, problem: Problem) -> str | None:
     precision = np.finfo(problem.dtype)
     if precision.bits >= 64:
         return None
-    # In each step the step size has the same rounding error, at most `eps` of it. So the
-    # errors add up to `eps` times the number of steps, as a fraction of the mean.
+    # Each step may be wrong by `eps` as a fraction of the state. The errors may have the
+    # same sign in all steps, so they are taken to add up.
     fraction = float(precision.eps) * problem.finest_steps
     # No estimate reports a standard error below this floor (see `rounding_floor`). Rounding
     # may be most of a standard error up to twice the floor.

@@ -90,5 +90,6 @@ def samples_of_paths(
     """The samples of independent paths, from the values of the paths on all levels, and
     which of the paths failed. Each sample is combined from the levels with these weights.
     """
+    # Of shape (combinations, n, numbers). What is `Averaged` is averaged over the samples.
     averaged = Averaged(combinations(weights, values))
     return Samples(averaged, good=~jnp.any(failed, axis=0), num_failed=failed)

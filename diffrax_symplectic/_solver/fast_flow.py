@@ -137,7 +137,8 @@ class LinearFlow(AbstractSymplecticSolver, diffrax.AbstractWrappedSolver[Any]):
 
     def check(self, terms, t0, y0, args):
         check_pair(y0)
-        # `momentum_first` finds the friction in Diffrax's own Langevin terms.
+        # `momentum_first` finds the friction in Diffrax's own Langevin terms. The flow gets
+        # `y0` in its own order.
         terms, _ = momentum_first(terms, y0)
         drift, friction, _ = split_friction(terms)
         if len(friction) > 0:

@@ -23,7 +23,8 @@ rule is a function with the decorator `rule`:
 - `control_flow.py`: loops and branches.
 - `linear_algebra.py`: operations for which JAX calls LAPACK.
 
-`operation.py` and `mlir.py` read an operation from MLIR, in which JAX holds programs. If an
+`operation.py` and `mlir.py` read an operation from MLIR, in which JAX holds programs.
+`tensor.py` has the tensors, and `backend.py` Dr.Jit and its types of arrays. If an
 operation has no rule, `Replay` raises a `NotReplayed` with the name of the operation and
 the location that it comes from.
 

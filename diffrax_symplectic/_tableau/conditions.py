@@ -197,9 +197,10 @@ def _strong_conditions_partitioned(tableau: PartitionedTableau) -> dict:
 
 @_strong_conditions.register
 def _strong_conditions_additive(tableau: AdditiveTableau) -> dict:
-    # The strong expansion of the solution has the terms of the weak expansion, and at order
-    # 3/2 also integrals that contain the space-time area `H`.
-    first, second = _weak_conditions(tableau)
+    """The conditions for strong order 3/2."""
+    # The strong expansion of the solution has the terms of the weak expansion up to order
+    # 2, and also integrals that contain the space-time area `H`.
+    for_order_1, for_order_2 = _weak_conditions(tableau)
     alpha = tableau.alpha
     c1 = tableau.c1
     # A tableau without `H` gets zeros, and fails the conditions on `H`.
@@ -214,8 +215,8 @@ def _strong_conditions_additive(tableau: AdditiveTableau) -> dict:
         if name not in ("W", "H"):
             others[f"beta[{name}].c1"] = weights @ c1
     return {
-        **first,
-        **second,
+        **for_order_1,
+        **for_order_2,
         "alpha.B[H]e - 1": alpha @ B_H.sum(axis=1) - 1,
         "beta[W].c1 - 1/2": tableau.beta["W"] @ c1 - 1 / 2,
         "beta[H].c1 + 1": beta_H @ c1 + 1,

@@ -64,7 +64,11 @@ def chosen_basis(problem: Problem, degree: int | None) -> ChosenBasis:
 
     - with a `degree`, the polynomials of this degree;
     - otherwise the finest grid that fits into memory and time;
-    - otherwise the polynomials of the highest degree that fit into time.
+    - otherwise the polynomials of the highest degree that fit into time;
+    - for degrees up to 2 in many dimensions, polynomials by averages of derivatives.
+
+    A fit costs as many steps as there are ends: for each point at which it is made, one for
+    each node, an outcome of the random variables of a step.
 
     Raises a `ValueError` if the fit needs too much memory, or for random variables without
     finitely many outcomes.
