@@ -170,7 +170,7 @@ def _extrapolation_weights(
 def _powers_in_error(order: int | float, count: int) -> Float[np.ndarray, " count"]:
     """The first powers of the step size in the error: they begin with the order, and rise
     by 1, or for order 1/2 by 1/2."""
-    return order + min(order, 1) * np.arange(count)
+    return float(order) + min(order, 1) * np.arange(count)
 
 
 def combinations(
