@@ -206,7 +206,7 @@ def check_memory(
     name: str, number: int, bytes_of_each: int, device: Any = None
 ) -> None:
     """Raises a `ValueError` if the argument of this name asks for more paths at once than
-    fit in the memory of a device, or without a `device` in that of this machine. `number`
+    fit in the memory of a device, or without a `device` in this machine's memory. `number`
     is its value, the number of paths. A path takes `bytes_of_each` or more."""
     needed = number * bytes_of_each
     memory = _memory_of(device)

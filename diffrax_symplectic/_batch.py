@@ -19,7 +19,7 @@ from ._custom_types import IntScalarLike
 _T = TypeVar("_T")
 
 # Stragglers are the paths that need more work than most. They are gathered from the batch
-# and served in groups. The size of a group is that of the batch divided by this number, so
+# and served in groups. A group has the size of the batch divided by this number, so
 # that there are at most this many groups. Groups are small, since usually there are few
 # stragglers, and each group costs its full size. When all paths computed for as long as any
 # was pending, ensembles with a few hard paths took 8 to 85 times as long.
@@ -85,7 +85,7 @@ def _all_batched(values: PyTree) -> PyTree[bool]:
 
 
 # JAX cannot differentiate a custom batching rule in reverse mode. So the function has a
-# rule for derivatives, too: that of the identity.
+# rule for derivatives, too, the rule of the identity.
 _batched_together = jax.custom_jvp(_batched_without_derivative)
 
 
@@ -184,7 +184,7 @@ def _none_if_batched(is_batched: bool, x: Array) -> Array | None:
 
 
 def _with_axis(tree: _T) -> _T:
-    """The arrays of one path as those of a batch of one path."""
+    """The arrays of one path as a batch of one path."""
     return jtu.tree_map(lambda x: x[None], tree)
 
 

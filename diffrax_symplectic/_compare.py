@@ -277,7 +277,7 @@ def _solve_batch(
     make_path: Callable,
 ) -> _SolveBatch:
     """Returns a compiled function that solves for a batch of paths by one solver, each with
-    Brownian paths `make_path(shape, key)` in place of those of the terms."""
+    Brownian paths `make_path(shape, key)` in place of the terms' own paths."""
     solver = with_programs(solver, t0, y0, args)
     # Terms that share a Brownian motion have equal numbers, and get the same new path.
     numbers = motion_numbers(random_paths(terms))

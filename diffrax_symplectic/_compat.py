@@ -364,7 +364,7 @@ def with_only_ys_differentiable(loop_state: Any) -> Any:
 def run_steps(adjoint: Any, outer_while_loop: Callable, **kwargs: Any) -> Any:
     """Runs Diffrax's loop over steps for an adjoint. It calls `outer_while_loop` for the
     loop over steps. Inside of it is a loop over the times to save at, without derivatives.
-    `kwargs` are those of `adjoint.loop`."""
+    `kwargs` are the arguments of `adjoint.loop`."""
     return adjoint._loop(
         **kwargs,
         event=None,

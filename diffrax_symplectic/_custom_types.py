@@ -17,7 +17,7 @@ else:
 Args: TypeAlias = PyTree[Any]
 Y: TypeAlias = PyTree[Shaped[ArrayLike, "?*y"], "Y"]
 BM: TypeAlias = PyTree[Shaped[ArrayLike, "?*bm"], "BM"]
-# Several terms, such as those of the drift.
+# Several terms, such as all terms of the drift.
 Terms: TypeAlias = tuple[diffrax.AbstractTerm, ...]
 # Instances of `jax.Device`, which type checkers do not take for a type.
 Devices: TypeAlias = tuple[Any, ...]

@@ -128,7 +128,7 @@ def traced(fn: Callable, *inputs: PyTree, identity: Any = None) -> Traced:
     jaxpr = closed_jaxpr.jaxpr
     jaxpr = jaxpr.replace(eqns=[*map(_with_sums_of_products, jaxpr.eqns)])
     jaxpr, literals = _with_literals_as_constants(jaxpr)
-    # The leaves of `fn` come before those of the inputs.
+    # The leaves of `fn` come before the leaves of the inputs.
     num_fn_leaves = len(jtu.tree_leaves(fn))
     fn_arrays = [x for x in array_leaves[:num_fn_leaves] if x is not None]
     program = _Program(

@@ -101,7 +101,7 @@ class LevyAreaBrownianPath(AbstractWrappedPath):
         elif use_levy:
             segment = self._drawn_segment(t0, t1)
         else:
-            # The increment alone is that of the wrapped path.
+            # The increment alone is the wrapped path's.
             return self.path.evaluate(t0, t1)
         shape = increment_struct(self.path)
         return segment.as_increment(LevyAreaIncrement, shape, t1 - t0, use_levy)

@@ -101,7 +101,7 @@ class TruncatedBrownianPath(AbstractWrappedPath):
     k: int = eqx.field(static=True)
     # `None` means 1. (The number 1 would be one more leaf of the path.)
     unit: RealScalarLike | None
-    # A truncated law is not that of a step of size 1, scaled by `sqrt(h)`.
+    # A truncated law is not the law for a step of size 1, scaled by `sqrt(h)`.
     laws: ClassVar[None] = None  # pyright: ignore
 
     def __init__(

@@ -1,7 +1,6 @@
 """What `expectation` chooses: the law of the increments, the sampling, and its plan.
 
-The law is that of the Brownian increments: discrete, which suffices for means of smooth
-functions, or Gaussian.
+Increments are either discrete, which suffices for means of smooth functions, or Gaussian.
 """
 
 from collections.abc import Callable
@@ -34,7 +33,7 @@ _MOST_COMPONENTS_SORTED = 4
 # and the error bars of sorted paths were 23 and 8 times less.
 _MOST_REMAINDER = 0.01
 # Without a tolerance, an estimate by value functions ends after this fraction of its paths
-# if the error of the steps is far larger than that of sampling. (A smaller fraction may
+# if the error of the steps is far larger than the sampling error. (A smaller fraction may
 # miss rare paths.)
 _FRACTION_BESIDE_STEPS = 1 / 4
 # The most independent paths without a tolerance. (The other samplings have defaults.)
@@ -75,7 +74,7 @@ def choose(
     `docs/expectation.md` states the rules. Returns the problem, its sampling and its plan,
     which holds the reason for the choice. The sampling is the first of these:
 
-    1. `sampling`, if the user passed one, or else that of `start`;
+    1. `sampling`, if the user passed one, or else the sampling of `start`;
     2. the sampling that suits the problem, by `sampling_for`;
     3. in place of value functions, sorted paths, if they are possible and a trial shows
        that the fits of the value functions leave too much of the standard error.
@@ -128,7 +127,7 @@ def choose(
         # The user did not choose this plan, so it is changed to take less time.
         if isinstance(sampling, ValueFunctions):
             # A path with a control variate takes far longer than another. So sampling ends
-            # early where the error of the steps is far larger than that of sampling.
+            # early where the error of the steps is far larger than the sampling error.
             least = int(plan.num_samples * _FRACTION_BESIDE_STEPS)
             plan = plan._replace(least_beside_steps=least)
         if isinstance(sampling, ArrayRQMC) and tol is None:

@@ -26,7 +26,7 @@ from .linear_maps import arbitrary_direction
 
 
 # The fractional parts of the multiples of this number fill the interval from 0 to 1 evenly,
-# without a period that might be that of a drive.
+# without a period that a drive might have, too.
 _GOLDEN_RATIO = (1 + 5**0.5) / 2
 
 # A vector field at a time and a state: a `jax.tree_util.Partial` of one of the functions

@@ -196,7 +196,7 @@ class _Steps(NamedTuple):
 
     @property
     def around(self) -> Float[np.ndarray, "4"]:
-        """The times at which fields are compared, relative to that of a jump."""
+        """The times at which fields are compared, relative to the time of a jump."""
         return np.array([-self.far, -self.near, self.near, self.far])
 
 
@@ -239,7 +239,7 @@ def _first_jump_at_end(field: Field, problem: Problem, y0: Y) -> float | None:
     if steps is None:
         return None
     ends = steps.starts + steps.h
-    # Whether an end is that of the path, which may have more steps than are looked at.
+    # Whether an end is the end of the path, which may have more steps than are looked at.
     is_last = np.arange(1, len(ends) + 1) == problem.finest_steps
     # For each end the four times around it, and the end itself.
     times = (ends[:, None] + np.append(steps.around, 0)).astype(problem.dtype)

@@ -250,7 +250,7 @@ def _step_numbers_to_look_at(problem: Problem) -> Float[np.ndarray, " times"]:
 
 
 def _noise_of_user(problem: Problem) -> Terms:
-    """The noise without that of heat baths, which acts on momenta alone."""
+    """The noise without the noise of heat baths, which acts on momenta alone."""
     _, _, noise = split_friction(problem.terms)
     return tuple(term for term in noise if not isinstance(unwrapped(term), BathNoise))
 

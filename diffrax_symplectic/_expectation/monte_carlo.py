@@ -163,7 +163,7 @@ def _outputs(programs: list[Traced], key: PRNGKeyArray) -> Outputs:
             "`fn` must return a phi of the same structure and shapes on all levels; got "
             f"{', '.join(map(shapes, structs))}."
         )
-    # Rounding errors are those of the least precise dtype in phi.
+    # The least precise dtype in phi decides on rounding errors.
     dtypes = {leaf.dtype for leaf in jtu.tree_leaves(structs)}
     dtype = min(dtypes, key=lambda dtype: jnp.finfo(dtype).bits)
     return Outputs(layout, len(programs), str(dtype))

@@ -21,7 +21,7 @@ MOST_SAMPLES = 2**63
 
 class Averaged(NamedTuple):
     """What is averaged over samples: their values, and what else some samplings know of
-    them. Each field is an array whose last axis is that of all numbers of `phi`, or `None`
+    them. Each field is an array whose last axis is for all numbers of `phi`, or `None`
     if the sampling does not have it.
 
     - `value`: the value of a sample. The mean of the values is the estimate.

@@ -139,7 +139,7 @@ def functions_and_arrays(
     The functions must be hashable, since they are the key under which compiled kernels are
     kept. So they hold only the shapes and dtypes of arrays, not the values.
 
-    - `key`: the random key from which those of the paths are derived.
+    - `key`: the random key from which the keys of the paths are derived.
     - `own_args`: an example of the arrays in the `args` of a path if `args` are drawn for
         each path, and otherwise `None`.
     - `paths_differ`: whether each path has its own initial state and `args`.

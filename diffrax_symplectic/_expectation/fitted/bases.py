@@ -1,4 +1,4 @@
-"""The bases in which value functions are fitted: what a basis is, and those of polynomials.
+"""The bases in which value functions are fitted: what a basis is, and polynomial bases.
 (The basis on a grid is in `grid.py`.)"""
 
 import abc

@@ -110,7 +110,7 @@ class Mixture(eqx.Module):
     def draw_law(self, key: PRNGKeyArray) -> Int[Array, ""]:
         """The number of the law by which the path with this key draws, on all levels."""
         # These two numbers take the place of a step and a level. No level has this number,
-        # so the words are independent of those of the noise.
+        # so the words are independent of the words of the noise.
         place = jnp.array(0), jnp.array(len(self.cuts))
         (words,) = random_words(key, place, 1, 1)
         uniform = words.astype(self.shares.dtype) / 2.0**32
@@ -144,8 +144,8 @@ def _widened(law: Discrete, width: float) -> np.ndarray:
 
 
 def _tilted(law: Discrete, tilt: float) -> np.ndarray:
-    """The probabilities of an exponentially tilted law, proportional to those of the law
-    times `exp(tilt * value)`."""
+    """The probabilities of an exponentially tilted law, proportional to the probabilities
+    of the law times `exp(tilt * value)`."""
     weights = np.array(law.probabilities) * np.exp(tilt * np.array(law.values))
     return weights / np.sum(weights)
 

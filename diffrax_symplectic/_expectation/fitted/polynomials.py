@@ -109,5 +109,5 @@ def least_squares(
     c = jax.lax.fori_loop(0, _REFINEMENTS, refine, no_fit)
     # (P, fits, m)
     c = jnp.moveaxis(c, 0, 1)
-    # From the coefficients of the scaled columns to those of the columns of `B`.
+    # From coefficients of the scaled columns to coefficients of the columns of `B`.
     return c / lengths[:, None, None]

@@ -237,7 +237,7 @@ def _fits(
 
 
 def _joined(functions_of_levels: Sequence[FittedFunctions]) -> FittedFunctions:
-    """Joins the functions of several levels along their leading axis, that of levels."""
+    """Joins the functions of several levels along their leading axis, for the levels."""
     if len(functions_of_levels) == 1:
         return functions_of_levels[0]
     return jtu.tree_map(lambda *xs: jnp.concatenate(xs), *functions_of_levels)
